@@ -1,0 +1,57 @@
+# `make example` and `make test` do everything on a fresh machine; each target sets up .venv first.
+PYTHON ?= python3
+JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+OUT ?= runs/$(notdir $(basename $(WORKFLOW)))
+
+.PHONY: help example run test lint bench pictures clean
+help:
+	@echo "make example                 the built-in flight, from photos to scored points, in runs/example"
+	@echo "make run WORKFLOW=file.toml  a flight of yours, in runs/NAME (OUT=folder to choose)"
+	@echo "make test | lint | bench     the tests, the checks of the code, the timings as ratios"
+	@echo "make pictures                the pictures of the README, from runs/example"
+	@echo "make clean                   removes runs/, example/ and .venv"
+
+# Dependencies are installed only when what names them changes; sources are used in place.
+$(READY): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+example/workflow.toml: | $(READY)
+	rm -rf example
+	$(BIN)/epitransfer example example
+
+example: example/workflow.toml
+	$(MAKE) --no-print-directory run WORKFLOW=example/workflow.toml OUT=runs/example
+	$(BIN)/python benchmarks/example_truth.py example runs/example
+
+ifdef WORKFLOW
+include workflows/rules.mk
+run: $(RECORDS)
+	@$(BIN)/epitransfer status $(OUT)
+else
+run:
+	@echo "usage: make run WORKFLOW=workflows/NAME.toml [OUT=folder]" >&2; exit 2
+endif
+
+test: $(READY)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY) example/workflow.toml
+	$(BIN)/python benchmarks/kernels.py
+	$(BIN)/python benchmarks/whole_path.py example
+
+pictures: $(READY)
+	$(BIN)/python docs/pictures.py runs/example docs
+
+clean:
+	rm -rf runs example $(VENV)

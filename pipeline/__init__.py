@@ -1,0 +1,1 @@
+"""The library the stages are made of: geometry, geodesy, sources, matching, fusion, scoring. Never imports stages."""

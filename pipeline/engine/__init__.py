@@ -1,0 +1,1 @@
+"""What runs the stages: configuration, run folder, manifest, executors, progress, errors."""

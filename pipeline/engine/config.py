@@ -1,0 +1,230 @@
+"""Strict configuration: workflow file, command line and run folder into one frozen model per stage.
+
+An unknown section or key is an error that names the nearest known one; every value remembers where it came from.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from pipeline.engine.errors import InputError, UsageError
+from pipeline.engine.stage import StageConfig
+
+Sections = dict[str, dict[str, Any]]
+Models = Mapping[str, type[StageConfig]]
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """The resolved configuration of a run.
+
+    Args:
+        sections: One validated model per stage the workflow has a section for.
+        origins: "section.key" to where the value came from: default, the workflow's file name, or the command line.
+        given: The values that are not defaults, paths absolute: what the run folder keeps.
+    """
+
+    sections: Mapping[str, StageConfig]
+    origins: Mapping[str, str]
+    given: Mapping[str, Mapping[str, Any]]
+
+    def value(self, key: str) -> Any:
+        """The value of "section.key"; None where the workflow has no such section."""
+        section, _, name = key.partition(".")
+        return getattr(self.sections[section], name) if section in self.sections else None
+
+
+def load_workflow(path: Path, models: Models) -> Sections:
+    """Reads a workflow file and makes its paths absolute.
+
+    Args:
+        path: TOML file.
+        models: The configuration model of each known section.
+
+    Returns:
+        Section to key to value, not yet validated.
+
+    Raises:
+        InputError: The file cannot be read.
+        UsageError: It is not TOML, or a section is unknown.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            "E-CONFIG-01", "cannot read the workflow file", where=str(path), found=str(error), hint="check the path"
+        ) from error
+    try:
+        sections = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError("E-CONFIG-02", "the workflow file is not TOML", where=str(path), found=str(error)) from error
+    for name, section in sections.items():
+        _check_section(name, models, str(path))
+        if not isinstance(section, dict):
+            raise UsageError(
+                "E-CONFIG-03", f"{name} is not a section", where=str(path), found=repr(section), expected=f"[{name}]"
+            )
+    return absolute_paths(sections, models, path.resolve().parent)
+
+
+def absolute_paths(sections: Sections, models: Models, base: Path) -> Sections:
+    """Makes the path-valued keys of known sections absolute; URLs and numbers stay as they are."""
+    out: Sections = {}
+    for name, section in sections.items():
+        fields = models[name].model_fields
+        out[name] = {
+            key: _absolute(value, base) if key in fields and is_path(fields[key]) else value
+            for key, value in section.items()
+        }
+    return out
+
+
+def is_path(field: FieldInfo) -> bool:
+    """Whether a configuration key names files outside the run folder."""
+    extra = field.json_schema_extra
+    return isinstance(extra, dict) and bool(extra.get("path"))
+
+
+def parse_overrides(items: Iterable[str], models: Models) -> Sections:
+    """Reads `--set section.key=value` items; a value is TOML, or else plain text.
+
+    Raises:
+        UsageError: An item has no "=", or its section is unknown.
+    """
+    sections: Sections = {}
+    for item in items:
+        key, separator, text = item.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not (separator and dot and name):
+            raise UsageError(
+                "E-CONFIG-04", "--set needs section.key=value", found=item, hint="--set depth.max_range_m=80"
+            )
+        _check_section(section, models, f"--set {item}")
+        sections.setdefault(section, {})[name] = _toml_value(text.strip())
+    return absolute_paths(sections, models, Path.cwd())
+
+
+def resolve(layers: Iterable[tuple[str, Sections]], models: Models) -> Configuration:
+    """Merges layers (later ones win) and validates every section.
+
+    Args:
+        layers: (origin, sections) pairs, weakest first.
+        models: The configuration model of each known section.
+
+    Raises:
+        UsageError: An unknown key, or a value its model refuses.
+    """
+    given: dict[str, dict[str, Any]] = {}
+    origins: dict[str, str] = {}
+    for origin, sections in layers:
+        for name, section in sections.items():
+            given.setdefault(name, {})
+            for key, value in section.items():
+                given[name][key] = value
+                origins[f"{name}.{key}"] = origin
+    resolved: dict[str, StageConfig] = {}
+    for name, model in models.items():
+        if name not in given:
+            continue
+        _check_keys(name, given[name], model, origins)
+        try:
+            resolved[name] = model.model_validate(given[name])
+        except ValidationError as error:
+            raise _explained(name, error, origins) from error
+        for key in model.model_fields:
+            origins.setdefault(f"{name}.{key}", "default")
+    return Configuration(resolved, origins, given)
+
+
+def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Writes flat sections as TOML."""
+    blocks = []
+    for name, section in sections.items():
+        lines = [f"[{name}]"] + [f"{key} = {_toml_text(value)}" for key, value in section.items() if value is not None]
+        blocks.append("\n".join(lines) + "\n")
+    return "\n".join(blocks)
+
+
+def _toml_text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_text(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml_text(item)}" for key, item in value.items()) + " }"
+    # JSON's escapes are a subset of those of a TOML basic string.
+    return json.dumps(str(value), ensure_ascii=False)
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _absolute(value: Any, base: Path) -> Any:
+    if isinstance(value, str) and "://" not in value and not _is_number(value):
+        return str((base / Path(value).expanduser()).absolute())
+    if isinstance(value, list):
+        return [_absolute(item, base) for item in value]
+    return value
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_section(name: str, models: Models, where: str) -> None:
+    if name not in models:
+        raise UsageError(
+            "E-CONFIG-05",
+            f"unknown section [{name}]",
+            where=where,
+            expected=", ".join(models),
+            hint=_nearest(name, models) or "remove it",
+        )
+
+
+def _check_keys(name: str, section: Mapping[str, Any], model: type[StageConfig], origins: Mapping[str, str]) -> None:
+    for key in section:
+        if key not in model.model_fields:
+            raise UsageError(
+                "E-CONFIG-06",
+                f"unknown key {name}.{key}",
+                where=origins[f"{name}.{key}"],
+                expected=", ".join(model.model_fields),
+                hint=_nearest(key, model.model_fields) or "remove it",
+            )
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
+    return f"did you mean {close[0]}?" if close else ""
+
+
+def _explained(name: str, error: ValidationError, origins: Mapping[str, str]) -> UsageError:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in (name, *first["loc"][:1]))
+    return UsageError(
+        "E-CONFIG-07",
+        f"{key} has a value that is not allowed",
+        where=origins.get(key, "workflow"),
+        found=repr(first.get("input")),
+        expected=str(first["msg"]),
+    )

@@ -1,0 +1,150 @@
+"""Where the shards run: in this process, in several, or on a Dask cluster. Results always come in order."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+from pipeline.engine.errors import MissingPartError, ResourceError
+from pipeline.engine.threads import limit_threads
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+def usable_cores() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Executor(Protocol):
+    """Applies a function to items; the results come in the items' order, whatever runs where."""
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Results in order; an exception in a worker is raised here."""
+
+    def __enter__(self) -> Self:
+        """Workers start when they are first needed."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Stops the workers."""
+
+
+class SerialExecutor:
+    """Runs in this process."""
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """As `Executor.map`."""
+        return map(function, items)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+class ProcessExecutor:
+    """Runs in several processes of this machine.
+
+    Args:
+        jobs: Number of processes.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """As `Executor.map`; no more than two shards per process wait, so memory does not grow with the flight.
+
+        Raises:
+            ResourceError: A worker was killed.
+        """
+        if self._pool is None:
+            # forkserver: a fork of this process would carry the locks of its threads along.
+            context = multiprocessing.get_context("forkserver")
+            self._pool = ProcessPoolExecutor(self._jobs, mp_context=context, initializer=limit_threads)
+        source = iter(items)
+        waiting: deque[Future[Result]] = deque(
+            self._pool.submit(function, item) for item in islice(source, 2 * self._jobs)
+        )
+        try:
+            while waiting:
+                result = waiting.popleft().result()
+                waiting.extend(self._pool.submit(function, item) for item in islice(source, 1))
+                yield result
+        except BrokenProcessPool as error:
+            raise ResourceError(
+                "E-EXEC-01", "a worker process was killed", found=str(error),
+                hint="most likely out of memory: use --jobs 1, or a smaller match.max_image_px",
+            ) from error
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+class DaskExecutor:
+    """Runs on a Dask cluster that sees the same folders.
+
+    Args:
+        address: Of the scheduler, "tcp://host:8786".
+
+    Raises:
+        MissingPartError: Dask is not installed.
+        ResourceError: No scheduler answers there.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            from distributed import Client  # noqa: PLC0415 - an optional part
+        except ImportError as error:
+            raise MissingPartError(
+                "E-EXEC-02", "Dask is not installed", hint="pip install 'epitransfer[dask]'"
+            ) from error
+        try:
+            self._client: Any = Client(address, timeout=10)
+        except (OSError, TimeoutError) as error:
+            raise ResourceError(
+                "E-EXEC-03", "no Dask scheduler answers", where=address, found=str(error), hint="check --scheduler"
+            ) from error
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """As `Executor.map`."""
+        source = iter(items)
+        ahead = 2 * max(1, sum(self._client.nthreads().values()))
+        waiting: deque[Any] = deque(
+            self._client.submit(function, item, pure=False) for item in islice(source, ahead)
+        )
+        while waiting:
+            result: Result = waiting.popleft().result()
+            waiting.extend(self._client.submit(function, item, pure=False) for item in islice(source, 1))
+            yield result
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()
+
+
+def executor_for(jobs: int, scheduler: str | None = None) -> Executor:
+    """The executor that `--jobs` and `--scheduler` ask for."""
+    if scheduler:
+        return DaskExecutor(scheduler)
+    return ProcessExecutor(jobs) if jobs > 1 else SerialExecutor()

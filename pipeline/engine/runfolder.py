@@ -1,0 +1,156 @@
+"""The run folder: records of finished stages, the commit of a stage's outputs, and the manifest.
+
+A stage's outputs are made in `.work/`, renamed as a whole to `.pending/STAGE` (the commit), and rolled forward from there:
+old output aside, new one in place, the stage's record last. Opening a folder finishes what a killed run had committed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine.errors import UsageError
+from schemas import TABLES
+
+RECORD = "record.json"
+DATASETS = frozenset({"matches", "depths", "points", "scores"})
+
+
+class RunFolder:
+    """A folder that holds one run.
+
+    Args:
+        root: The folder; made when it is missing.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.absolute()
+
+    @property
+    def workflow(self) -> Path:
+        """The configuration the run was made with."""
+        return self.root / "workflow.toml"
+
+    @property
+    def cache(self) -> Path:
+        """Content-addressed files that later runs may reuse."""
+        return self.root / ".cache"
+
+    def output(self, name: str) -> Path:
+        """Where a table or dataset lies."""
+        return self.root / output_name(name)
+
+    def record_path(self, stage: str) -> Path:
+        """The record of the stage's last successful run: the target a Make rule waits for."""
+        return self.root / ".stages" / f"{stage}.json"
+
+    def record(self, stage: str) -> dict[str, Any] | None:
+        """The record of the stage's last successful run."""
+        try:
+            record: dict[str, Any] = json.loads(self.record_path(stage).read_text())
+        except (OSError, ValueError):
+            return None
+        return record
+
+    def intact(self, record: dict[str, Any]) -> bool:
+        """Whether the outputs a record names are still there in their recorded size."""
+        return all(
+            (path := self.output(name)).exists() and tree_size(path) == entry["bytes"]
+            for name, entry in record["outputs"].items()
+        )
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Holds the folder for one process and finishes what a killed one left.
+
+        Raises:
+            UsageError: Another process holds it.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        with (self.root / ".lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise UsageError(
+                    "E-RUN-01", "another process works on this run folder", where=str(self.root),
+                    hint="wait for it, or use another --out",
+                ) from error
+            self.recover()
+            yield
+
+    def work(self, stage: str, key: str) -> Path:
+        """A folder to make outputs in; one left by a killed run with the same key is taken up again."""
+        folder = self.root / ".work" / f"{stage}-{key[:16]}"
+        for other in (self.root / ".work").glob(f"{stage}-*"):
+            if other != folder:
+                shutil.rmtree(other)
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def commit(self, stage: str, work: Path, record: dict[str, Any]) -> None:
+        """Puts a stage's outputs in place together with its record."""
+        write_json(work / RECORD, record)
+        pending = self.root / ".pending" / stage
+        pending.parent.mkdir(exist_ok=True)
+        work.rename(pending)
+        self._roll_forward(pending)
+
+    def recover(self) -> None:
+        """Finishes the commits a killed run had begun."""
+        for pending in sorted((self.root / ".pending").glob("*")):
+            self._roll_forward(pending)
+
+    def _roll_forward(self, pending: Path) -> None:
+        stage = pending.name
+        aside = self.root / ".old" / stage
+        if (pending / RECORD).exists():
+            record = json.loads((pending / RECORD).read_text())
+            for name in record["outputs"]:
+                made, place = pending / output_name(name), self.output(name)
+                if made.exists():
+                    shutil.rmtree(aside, ignore_errors=True)
+                    aside.mkdir(parents=True)
+                    if place.exists():
+                        place.rename(aside / place.name)
+                    made.rename(place)
+            self.record_path(stage).parent.mkdir(exist_ok=True)
+            (pending / RECORD).rename(self.record_path(stage))
+        shutil.rmtree(pending)
+        shutil.rmtree(aside, ignore_errors=True)
+        self.write_manifest()
+
+    def write_manifest(self) -> None:
+        """Gathers the records into manifest.json."""
+        records = {path.stem: json.loads(path.read_text()) for path in sorted((self.root / ".stages").glob("*.json"))}
+        ordered = dict(sorted(records.items(), key=lambda item: (item[1].get("position", 0), item[0])))
+        write_json(self.root / "manifest.json", {"schema": 1, "stages": ordered})
+
+
+def output_name(name: str) -> str:
+    """File or folder name of an output: `scores/` and other datasets are folders, other tables single files."""
+    bare = name.rstrip("/")
+    return bare if bare in DATASETS or bare not in TABLES else f"{bare}.parquet"
+
+
+def tree_size(path: Path) -> int:
+    """Bytes of a file, or of all files of a folder."""
+    if path.is_file():
+        return path.stat().st_size
+    return sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON atomically."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w", encoding="utf-8") as stream:
+        json.dump(value, stream, indent=1, sort_keys=False, default=str)
+        stream.write("\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)

@@ -1,0 +1,61 @@
+"""Parquet files of the run folder: one way to write them, one way to read them with their schema checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.dataset
+import pyarrow.parquet as pq
+
+from pipeline.engine.errors import InputError
+from schemas import TABLES, SchemaError
+
+_ROW_GROUP = 131_072
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Writes a table so that equal tables give equal bytes: zstd, byte-stream-split floats, dictionaries on text."""
+    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    pq.write_table(
+        table,
+        path,
+        compression="zstd",
+        compression_level=3,
+        use_dictionary=texts,
+        use_byte_stream_split=floats,
+        row_group_size=_ROW_GROUP,
+    )
+
+
+def parquet_files(path: Path) -> list[Path]:
+    """The Parquet files of a table: the file itself, or a dataset folder's parts in order."""
+    return [path] if path.is_file() else sorted(path.glob("*.parquet"))
+
+
+def read_table(path: Path, name: str) -> pa.Table:
+    """Reads a table or a dataset's parts as one table.
+
+    Raises:
+        InputError: Missing, unreadable, or not of the schema `name`.
+    """
+    schema = TABLES[name]
+    files = parquet_files(path)
+    if not path.exists():
+        raise InputError("E-TABLE-01", f"the table {name} is missing", where=str(path), hint="run the stage before")
+    try:
+        tables = [pq.read_table(file, partitioning=None) for file in files]
+        table = pa.concat_tables(tables) if tables else schema.empty()
+        schema.check_schema(table.schema)
+    except SchemaError as error:
+        raise InputError(
+            "E-TABLE-02", f"the table {name} is of another schema", where=str(path), found=str(error),
+            hint="rerun the stage that writes it",
+        ) from error
+    except (pa.ArrowInvalid, pa.ArrowTypeError, OSError) as error:
+        raise InputError(
+            "E-TABLE-03", f"the table {name} cannot be read", where=str(path), found=str(error),
+            hint="rerun the stage that writes it",
+        ) from error
+    return table

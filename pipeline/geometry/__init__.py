@@ -1,0 +1,1 @@
+"""Rotations, cameras, epipolar transfer, triangulation and covariance. Imports numpy alone."""

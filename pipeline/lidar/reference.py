@@ -1,0 +1,98 @@
+"""Reference depth at any pixel: a plane through the nearest visible returns, fitted where planes are affine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.arrays import Bools, Floats
+from pipeline.lidar.visibility import VisibleReturns
+
+# Returns a plane is fitted to: three unknowns, and enough over to see that it is no plane.
+NEIGHBOURS = 8
+# No return used may be further from the pixel than this many distances between returns.
+_REACH_FOOTPRINTS = 2.5
+_LEAST_REACH_PX = 4.0
+# The neighbours surround the pixel when their mean is not further off than this share of their own spread.
+_OFF_CENTRE = 0.75
+# Spread about the plane, in shares of the depth, beyond which the pixel is at an edge or on no surface.
+_LARGEST_SPREAD = 0.01
+# Neighbours nearly in one line of the image fix no plane.
+_LEAST_ROUNDNESS = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Reference depths at pixels.
+
+    Args:
+        depth_m: (n,) along the optical axis, m; NaN where there is none.
+        spread_m: (n,) root mean square of the returns about the local surface, in depth, m; NaN where there is none.
+        valid: (n,) whether there is one.
+    """
+
+    depth_m: Floats
+    spread_m: Floats
+    valid: Bools
+
+
+def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal_visible: Floats) -> Reference:
+    """Reference depths at pixels from the visible returns around them.
+
+    The inverse depth of a plane is affine in ideal (undistorted) pixels, so the fit is exact on planes at any slant.
+
+    Args:
+        pixels: (n, 2) u, v of the image as given.
+        ideal_pixels: (n, 2) the same without distortion, px (any scale common with `ideal_visible`); NaN gives none.
+        visible: The visible returns.
+        ideal_visible: (m, 2) their pixels without distortion.
+
+    Returns:
+        One depth per pixel.
+    """
+    count = len(pixels)
+    depth, spread = np.full(count, np.nan), np.full(count, np.nan)
+    ok = np.isfinite(pixels).all(axis=1) & np.isfinite(ideal_pixels).all(axis=1)
+    rows = np.flatnonzero(ok)
+    if len(visible.depth_m) < NEIGHBOURS or not len(rows):
+        return Reference(depth, spread, np.zeros(count, np.bool_))
+    distance, near = (np.asarray(found) for found in cKDTree(visible.pixels).query(pixels[rows], k=NEIGHBOURS))
+    reach = np.maximum(_REACH_FOOTPRINTS * np.median(visible.footprint_px[near], axis=1), _LEAST_REACH_PX)
+    close = distance[:, -1] <= reach
+    rows, near = rows[close], near[close]
+    inverse, residual, sound = _plane_at_centre(
+        ideal_visible[near] - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
+    )
+    sound &= (inverse > 0.0) & (residual <= _LARGEST_SPREAD * inverse)
+    rows, inverse, residual = rows[sound], inverse[sound], residual[sound]
+    depth[rows] = 1.0 / inverse
+    spread[rows] = residual / inverse**2
+    return Reference(depth, spread, np.isfinite(depth))
+
+
+def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Bools]:
+    """Least-squares affine function through neighbours, at offset zero.
+
+    Args:
+        offset: (n, k, 2) pixel offsets of the neighbours.
+        inverse: (n, k) inverse depths, 1/m.
+
+    Returns:
+        Value at zero (n,), root mean square residual with k - 3 degrees of freedom (n,), and whether the neighbours
+        surround the pixel and fix a plane (n,).
+    """
+    mean = offset.mean(axis=1)
+    centred = offset - mean[:, None, :]
+    level = inverse.mean(axis=1)
+    scatter = np.einsum("nki,nkj->nij", centred, centred)
+    trace, determinant = np.trace(scatter, axis1=1, axis2=2), np.linalg.det(scatter)
+    sound: Bools = determinant > (_LEAST_ROUNDNESS * trace) ** 2
+    sound &= np.einsum("ni,ni->n", mean, mean) <= _OFF_CENTRE**2 * trace / offset.shape[1]
+    scatter = np.where(sound[:, None, None], scatter, np.eye(2))
+    moment = np.einsum("nki,nk->ni", centred, inverse - level[:, None])
+    slope = np.linalg.solve(scatter, moment[..., None])[..., 0]
+    residual = inverse - level[:, None] - np.einsum("nki,ni->nk", centred, slope)
+    rms = np.sqrt(np.sum(residual**2, axis=1) / (offset.shape[1] - 3))
+    return level - np.einsum("ni,ni->n", mean, slope), rms, sound

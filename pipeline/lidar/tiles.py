@@ -1,0 +1,166 @@
+"""LAS, LAZ and COPC tiles: which files, what their headers say, and their returns by chunk."""
+
+from __future__ import annotations
+
+import glob
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import laspy
+import lazrs
+import numpy as np
+import pyproj
+
+from pipeline.engine.errors import InputError
+from pipeline.geometry.arrays import Bools, Floats
+from pipeline.lidar.tile_crs import tile_crs
+
+CHUNK_POINTS = 1_000_000
+SUFFIXES = (".las", ".laz")
+# ASPRS LAS 1.4 R15, table 17: low point (noise), high noise.
+_NOISE_CLASSES = (7, 18)
+# What laspy and its decoder raise on bytes that are not a tile.
+_UNREADABLE = (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError, TypeError, struct.error, EOFError,
+               KeyError, IndexError, OverflowError, MemoryError)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """What a tile's header says.
+
+    Args:
+        path: The file.
+        crs_wkt: Its CRS as WKT 2, three-dimensional.
+        point_count: Returns in the file.
+        minimum: Lower corner x, y, z in the tile's CRS and units (x east, whatever the CRS's axis order).
+        maximum: Upper corner.
+    """
+
+    path: Path
+    crs_wkt: str
+    point_count: int
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    @property
+    def crs(self) -> pyproj.CRS:
+        """The tile's CRS."""
+        return pyproj.CRS.from_wkt(self.crs_wkt)
+
+    def meets(self, lower: Floats, upper: Floats) -> bool:
+        """Whether the tile's horizontal box meets another in the same CRS.
+
+        Args:
+            lower: (2+,) lower corner.
+            upper: (2+,) upper corner.
+        """
+        if self.point_count == 0:
+            return False
+        return all(self.minimum[i] <= upper[i] and self.maximum[i] >= lower[i] for i in range(2))
+
+
+def expand(tiles: str | Sequence[str]) -> tuple[Path, ...]:
+    """The files a path, a folder, a glob or a list of these names, in order and without repeats.
+
+    Args:
+        tiles: Paths or globs; a folder stands for the tiles in it.
+
+    Returns:
+        Absolute paths.
+
+    Raises:
+        InputError: One of them names no file.
+    """
+    found: dict[Path, None] = {}
+    for text in [tiles] if isinstance(tiles, str) else tiles:
+        path = Path(text).expanduser()
+        if path.is_dir():
+            matches = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+        elif path.is_file():
+            matches = [path]
+        else:
+            matches = sorted(Path(p) for p in glob.glob(str(path), recursive=True) if Path(p).is_file())  # noqa: PTH207
+        if not matches:
+            raise InputError(
+                "E-LIDAR-01", "no LiDAR tile there", where=text, expected="a .las or .laz file, a folder or a glob",
+                hint="check score.lidar; relative paths are relative to the workflow file",
+            )  # fmt: skip
+        found.update(dict.fromkeys(match.absolute() for match in matches))
+    return tuple(found)
+
+
+def read_tile(path: Path, height_datum: str | None = None) -> Tile:
+    """Reads a tile's header.
+
+    Args:
+        path: LAS, LAZ or COPC file.
+        height_datum: As in `tile_crs`, for a tile whose CRS has no vertical part.
+
+    Raises:
+        InputError: Not a tile, or cut short.
+        UndeterminedError: The CRS or its vertical part is not known.
+    """
+    try:
+        with laspy.open(path, read_evlrs=True) as reader:
+            header = reader.header
+            lower, upper = (tuple(float(x) for x in corner) for corner in (header.mins, header.maxs))
+            count = int(header.point_count)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    crs = tile_crs(header, path, height_datum)
+    if count and not np.all(np.isfinite([*lower, *upper])):
+        raise InputError(
+            "E-LIDAR-08", "the tile's header has no finite bounds", where=str(path), found=f"{lower} .. {upper}",
+            hint="rewrite it: pdal translate",
+        )  # fmt: skip
+    return Tile(path, crs.to_wkt(), count, (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
+
+
+def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_points: int = CHUNK_POINTS) -> Iterator[Floats]:
+    """The returns of a tile in a horizontal box, by chunk; noise and withheld ones left out.
+
+    Args:
+        tile: From `read_tile`.
+        lower: (2+,) lower corner of the box, tile CRS.
+        upper: (2+,) upper corner.
+        chunk_points: Returns read at once.
+
+    Yields:
+        (n, 3) x, y, z in the tile's CRS and units, all finite; never empty.
+
+    Raises:
+        InputError: The file is damaged or cut short.
+    """
+    seen = 0
+    try:
+        with laspy.open(tile.path) as reader:
+            for chunk in reader.chunk_iterator(chunk_points):
+                seen += len(chunk)
+                points = _wanted(chunk, lower, upper)
+                if len(points):
+                    yield points
+    except _UNREADABLE as error:
+        raise _unreadable(tile.path, error) from error
+    if seen < tile.point_count:
+        raise InputError(
+            "E-LIDAR-02", "the tile is cut short", where=str(tile.path), found=f"{seen:,} returns",
+            expected=f"{tile.point_count:,} as its header says", hint="copy the file again",
+        )  # fmt: skip
+
+
+def _wanted(chunk: laspy.ScaleAwarePointRecord, lower: Floats, upper: Floats) -> Floats:
+    x, y = np.asarray(chunk.x, np.float64), np.asarray(chunk.y, np.float64)
+    keep: Bools = (x >= lower[0]) & (x <= upper[0]) & (y >= lower[1]) & (y <= upper[1])
+    keep &= ~np.isin(np.asarray(chunk.classification), _NOISE_CLASSES) & ~np.asarray(chunk.withheld, np.bool_)
+    index = np.flatnonzero(keep)
+    points = np.column_stack([x[index], y[index], np.asarray(chunk.z, np.float64)[index]])
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _unreadable(path: Path, error: BaseException) -> InputError:
+    return InputError(
+        "E-LIDAR-02", "the LiDAR tile cannot be read", where=str(path), found=str(error) or type(error).__name__,
+        expected="a LAS, LAZ or COPC file, whole", hint="copy the file again, or take it out of score.lidar",
+    )  # fmt: skip

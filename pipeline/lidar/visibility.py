@@ -1,0 +1,198 @@
+"""Which LiDAR returns a camera sees.
+
+Returns are samples; what blocks a view are the surfaces between them. Two tests stand for these surfaces:
+
+* columns: what lies above the ground stands on a column (a roof on its walls, a crown on its tree), so a return is
+  hidden when a column on the way to the camera reaches above the line of sight. This is exact for what is
+  2.5-dimensional and needs no return on a wall.
+* z-buffer: in the image, a return is hidden or at a depth edge when its bin or a neighbouring one holds a return that
+  is nearer by more than the slope of the surface explains; a return with no others around is dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.cameras import Camera
+from pipeline.lidar.heightfield import HeightField
+
+# What stands within this many cells in front of a return is taken as the return's own surface.
+_OWN_CELLS = 1.5
+# The line of sight may pass this far below a top: the noise of LiDAR heights.
+_CLEARANCE_M = 0.1
+# Bins of the z-buffer in spacings of the returns as the camera sees them.
+_BIN_SPACINGS = 1.0
+_SMALLEST_BIN_PX = 2.0
+_LEVELS = 6
+# In its own bin and the eight around it a return on a surface has some nine others.
+_FEWEST_IN_BINS = 3
+# A background return is dropped where inverse depth rises towards the near side by more than this share ...
+_EDGE_SHARE = 0.08
+# ... and by more than this many times what it falls towards the far side, which is what a slope would do.
+_EDGE_ASYMMETRY = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A camera at its place.
+
+    Args:
+        camera: Intrinsics.
+        centre_in_enu_m: (3,) camera centre, ENU m.
+        rotation_enu_from_cam: (3, 3).
+    """
+
+    camera: Camera
+    centre_in_enu_m: Floats
+    rotation_enu_from_cam: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleReturns:
+    """Returns that a camera sees.
+
+    Args:
+        index: (n,) rows of the returns given.
+        pixels: (n, 2) u, v of the image as given (distorted).
+        depth_m: (n,) along the optical axis, m.
+        footprint_px: (n,) distance between neighbouring returns as the camera sees it, px.
+    """
+
+    index: Ints
+    pixels: Floats
+    depth_m: Floats
+    footprint_px: Floats
+
+
+def visible_returns(
+    view: View, points_in_enu_m: Floats, field: HeightField, spacing_m: float, max_range_m: float
+) -> VisibleReturns:
+    """The returns that a camera sees within a range.
+
+    Args:
+        view: The camera.
+        points_in_enu_m: (n, 3) returns, ENU m.
+        field: The height field of the returns, everything between them and the camera included.
+        spacing_m: Of the returns on the ground, m.
+        max_range_m: Largest Euclidean distance from the camera, m.
+    """
+    index, pixels, depth = in_image(view, points_in_enu_m, max_range_m)
+    seen = ~behind_columns(view.centre_in_enu_m, points_in_enu_m[index], field, max_range_m)
+    index, pixels, depth = index[seen], pixels[seen], depth[seen]
+    footprint = view.camera.focal_px * spacing_m / depth
+    seen = _passes_z_buffer(view.camera, pixels, depth, footprint)
+    return VisibleReturns(index[seen], pixels[seen], depth[seen], footprint[seen])
+
+
+def in_image(view: View, points_in_enu_m: Floats, max_range_m: float) -> tuple[Ints, Floats, Floats]:
+    """Which points fall into the image, were nothing in the way.
+
+    Args:
+        view: The camera.
+        points_in_enu_m: (n, 3) ENU, m.
+        max_range_m: Largest Euclidean distance, m.
+
+    Returns:
+        Rows (m,), pixels (m, 2) and depths (m,) in m of those in the image, before the camera and within range.
+    """
+    camera = view.camera
+    offset = points_in_enu_m - view.centre_in_enu_m
+    index = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= max_range_m**2)
+    index = index[offset[index] @ view.rotation_enu_from_cam[:, 2] > 0.0]
+    in_cam = offset[index] @ view.rotation_enu_from_cam
+    pixels = camera.project(in_cam)
+    inside = (
+        np.abs(pixels - ((camera.width - 1) / 2.0, (camera.height - 1) / 2.0))
+        <= (camera.width / 2.0, camera.height / 2.0)
+    ).all(axis=1)
+    # A distortion polynomial folds: far outside the field of view a point can get the pixel of another ray.
+    candidates = np.flatnonzero(inside)
+    if any(camera.distortion):
+        rays = camera.rays(pixels[candidates])
+        same = np.linalg.norm(rays - in_cam[candidates] / in_cam[candidates, 2:], axis=1) < 1e-6
+        candidates = candidates[same]
+    return index[candidates], pixels[candidates], in_cam[candidates, 2]
+
+
+def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range_m: float) -> Bools:
+    """Whether a column stands between the camera and each point: the horizon of the height field.
+
+    The field is sampled along rays of equal azimuth; the running maximum of the slope (rise over ground distance) along
+    each is the horizon as it is met at every distance, so that a point costs one look-up whatever lies before it.
+
+    Args:
+        centre: (3,) camera centre, ENU m.
+        points: (n, 3) ENU, m; all finite.
+        field: The height field.
+        max_range_m: Largest ground distance of a point, m.
+    """
+    if not len(points):
+        return np.zeros(0, np.bool_)
+    offset = points - centre
+    ground = np.hypot(offset[:, 0], offset[:, 1])
+    azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+    # Half a cell apart where the rays are widest; measured from the mean direction, so that +-180 deg is no seam.
+    reach = min(max_range_m, float(ground.max())) + field.cell_m
+    middle = np.arctan2(offset[:, 1].sum(), offset[:, 0].sum())
+    azimuth = (azimuth - middle + np.pi) % (2.0 * np.pi)
+    step = 0.5 * field.cell_m / reach
+    first = np.floor(azimuth.min() / step)
+    ray = (azimuth / step - first).astype(np.int64)
+    angles = (first + np.arange(int(ray.max()) + 1) + 0.5) * step + middle - np.pi
+    distance = (np.arange(int(reach / (0.5 * field.cell_m)) + 1) + 1.0) * 0.5 * field.cell_m
+    tops = field.at(
+        centre[0] + distance[None, :] * np.cos(angles)[:, None], centre[1] + distance[None, :] * np.sin(angles)[:, None]
+    )
+    slope = (tops - centre[2] - _CLEARANCE_M) / distance
+    horizon = np.maximum.accumulate(slope, axis=1)
+    last = np.floor((ground - _OWN_CELLS * field.cell_m) / (0.5 * field.cell_m)).astype(np.int64) - 1
+    met = np.where(last >= 0, horizon[ray, np.maximum(last, 0)], -np.inf)
+    hidden: Bools = offset[:, 2] < met * ground
+    return hidden
+
+
+def _passes_z_buffer(camera: Camera, pixels: Floats, depth: Floats, footprint: Floats) -> Bools:
+    """Drops returns that are alone or behind a depth edge, in bins as large as the returns are apart.
+
+    Near returns are further apart in pixels than far ones: bins double from level to level, every return enters every
+    level, and each is judged on the level of its own footprint.
+    """
+    keep = np.zeros(len(pixels), np.bool_)
+    if not len(pixels):
+        return keep
+    inverse = 1.0 / depth
+    bin_px = np.maximum(_BIN_SPACINGS * footprint, _SMALLEST_BIN_PX)
+    finest = float(bin_px.min())
+    level = np.clip(np.ceil(np.log2(bin_px / finest) - 1e-9), 0, _LEVELS - 1).astype(np.int64)
+    for k in np.unique(level):
+        size = finest * 2.0**k
+        columns, rows = int(camera.width // size) + 3, int(camera.height // size) + 3
+        cell = np.floor((pixels + 0.5) / size).astype(np.int64) + 1
+        flat = np.clip(cell[:, 0], 0, columns - 1) * rows + np.clip(cell[:, 1], 0, rows - 1)
+        mine = flat[level == k]
+        count = _around(np.bincount(flat, minlength=columns * rows).astype(np.float64), (columns, rows), "sum")
+        near, far = np.zeros(columns * rows), np.full(columns * rows, np.inf)
+        np.maximum.at(near, flat, inverse)
+        np.minimum.at(far, flat, inverse)
+        q = inverse[level == k]
+        rise = _around(near, (columns, rows), "max")[mine] - q
+        fall = q - _around(far, (columns, rows), "min")[mine]
+        edge = rise > np.maximum(_EDGE_SHARE * q, _EDGE_ASYMMETRY * fall)
+        keep[level == k] = (count[mine] >= _FEWEST_IN_BINS) & ~edge
+    return keep
+
+
+def _around(values: Floats, shape: tuple[int, int], what: str) -> Floats:
+    """Sum, maximum or minimum over each bin and the eight around it, flat."""
+    grid = values.reshape(shape)
+    if what == "sum":
+        out: Floats = ndimage.uniform_filter(grid, 3, mode="constant") * 9.0
+    elif what == "max":
+        out = ndimage.maximum_filter(grid, 3, mode="nearest")
+    else:
+        out = ndimage.minimum_filter(grid, 3, mode="nearest")
+    return np.rint(out).reshape(-1) if what == "sum" else out.reshape(-1)

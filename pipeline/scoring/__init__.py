@@ -1,0 +1,1 @@
+"""Depth and map metrics against reference depths. Imports numpy."""

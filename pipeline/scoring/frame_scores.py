@@ -1,0 +1,195 @@
+"""Scores of a shard of frames: the returns they see, reference depths at their matches' pixels, and the sums."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+
+from pipeline.geometry.arrays import Floats
+from pipeline.lidar.heightfield import HeightField, return_spacing_m
+from pipeline.lidar.nearby import LocalTiles, returns_near
+from pipeline.lidar.reference import Reference, reference_depth
+from pipeline.lidar.visibility import View, behind_columns, visible_returns
+from pipeline.scoring.calibration import CalibrationSums, MapSums
+from pipeline.scoring.depth_rows import AlignedDepths, align
+from pipeline.scoring.metrics import MethodSums
+from schemas import SCORES
+
+_COLUMNS = ["pair_id", "frame_id", "u", "v", "method", "depth_m", "sigma_depth_m", "kept"]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameView:
+    """A frame to be scored.
+
+    Args:
+        frame_id: Its name.
+        view: Its camera and pose.
+    """
+
+    frame_id: str
+    view: View
+
+
+@dataclass(frozen=True, slots=True)
+class ScoringJob:
+    """What is the same for every frame.
+
+    Args:
+        tiles: The LiDAR tiles and the way from their CRS.
+        depths: Folder of the dataset `depths`.
+        methods: Every method in it, the published one first.
+        max_range_m: Largest Euclidean distance from the camera that is scored, m.
+    """
+
+    tiles: LocalTiles
+    depths: Path
+    methods: tuple[str, ...]
+    max_range_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameScore:
+    """One frame's sums.
+
+    Args:
+        frame_id: Its name.
+        n_matches: Matches, with a reference or not.
+        n_visible: Returns the frame sees.
+        methods: One entry per method of the job.
+        calibration: Of the published method.
+        map: Of the published method.
+    """
+
+    frame_id: str
+    n_matches: int
+    n_visible: int
+    methods: tuple[MethodSums, ...]
+    calibration: CalibrationSums
+    map: MapSums
+
+
+@dataclass(frozen=True, slots=True)
+class _Surroundings:
+    """The returns near a shard's frames, how far apart they are, and what stands there; no field without returns."""
+
+    returns: Floats
+    spacing_m: float
+    field: HeightField | None
+
+    @staticmethod
+    def of(returns: Floats) -> _Surroundings:
+        if not len(returns):
+            return _Surroundings(returns, np.nan, None)
+        spacing = return_spacing_m(returns)
+        return _Surroundings(returns, spacing, HeightField.of(returns, spacing))
+
+
+def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table, list[FrameScore]]:
+    """Scores some frames; memory grows with the returns near them, not with the flight.
+
+    Args:
+        job: What is the same for every frame.
+        items: The frames.
+
+    Returns:
+        Rows of the table `pixels`, and one score per frame.
+
+    Raises:
+        InputError: A tile is damaged, or the rows of `depths` do not belong together.
+        UndeterminedError: A height datum or the geoid between two is not known.
+    """
+    ids = pa.array([item.frame_id for item in items])
+    dataset = ds.dataset(job.depths, format="parquet")
+    rows = align(dataset.to_table(columns=_COLUMNS, filter=ds.field("frame_id").isin(ids)), job.methods)
+    centres = np.array([item.view.centre_in_enu_m for item in items])
+    near = _Surroundings.of(returns_near(job.tiles, centres, job.max_range_m))
+    tables, scores = [], []
+    for item in items:
+        mine = rows.where(np.flatnonzero(rows.frame_id == item.frame_id))
+        reference, seen = _reference(item.view, mine.pixels, near, job.max_range_m)
+        has = np.flatnonzero(reference.valid)
+        scored = mine.where(has)
+        depth, spread = reference.depth_m[has], reference.spread_m[has]
+        sums = _sums(item.view, scored, depth, spread)
+        scores.append(FrameScore(item.frame_id, len(mine.pixels), seen, *sums))
+        tables.append(_table(scored, depth, spread))
+    return pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores
+
+
+def methods_of(depths: Path, published: str) -> tuple[str, ...]:
+    """The methods in a dataset `depths`: the published one first where it is there, the others by name."""
+    names: set[str] = set()
+    for batch in ds.dataset(depths, format="parquet").to_batches(columns=["method"]):
+        names.update(pc.unique(batch.column("method")).to_pylist())
+    return tuple(sorted(names, key=lambda name: (name != published, name)))
+
+
+def frames_in(depths: Path) -> set[str]:
+    """The ref frames in a dataset `depths`."""
+    names: set[str] = set()
+    for batch in ds.dataset(depths, format="parquet").to_batches(columns=["frame_id"]):
+        names.update(pc.unique(batch.column("frame_id")).to_pylist())
+    return names
+
+
+def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: float) -> tuple[Reference, int]:
+    """Reference depths at pixels within range, and how many returns the frame sees."""
+    if near.field is None or not len(pixels):
+        nothing = np.full(len(pixels), np.nan)
+        return Reference(nothing, nothing, np.zeros(len(pixels), np.bool_)), 0
+    visible = visible_returns(view, near.returns, near.field, near.spacing_m, max_range_m)
+    # The same feature is matched in several pairs: its reference is found once.
+    distinct, back = np.unique(pixels, axis=0, return_inverse=True)
+    rays, focal = view.camera.rays(distinct), view.camera.focal_px
+    found = reference_depth(distinct, focal * rays[:, :2], visible, focal * view.camera.rays(visible.pixels)[:, :2])
+    valid = found.valid & (found.depth_m * np.linalg.norm(rays, axis=1) <= max_range_m)
+    # A pixel on a wall or a pole with few returns of its own takes its plane from what is seen behind: a column says so.
+    points = view.centre_in_enu_m + (found.depth_m[:, None] * rays)[valid] @ view.rotation_enu_from_cam.T
+    valid[valid] = ~behind_columns(view.centre_in_enu_m, points, near.field, max_range_m)
+    back = back.ravel()
+    depth, spread = (np.where(valid, values, np.nan)[back] for values in (found.depth_m, found.spread_m))
+    return Reference(depth, spread, valid[back]), len(visible.depth_m)
+
+
+def _sums(
+    view: View, scored: AlignedDepths, reference: Floats, spread: Floats
+) -> tuple[tuple[MethodSums, ...], CalibrationSums, MapSums]:
+    common = np.asarray(scored.kept.all(axis=1))
+    methods = tuple(
+        MethodSums.of(scored.depth_m[:, m], reference, scored.kept[:, m], common) for m in range(len(scored.methods))
+    )
+    kept = scored.kept[:, 0]
+    rays = view.camera.rays(scored.pixels[kept]) @ view.rotation_enu_from_cam.T
+    depth, reference = scored.depth_m[kept, 0], reference[kept]
+    return (
+        methods,
+        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, spread[kept]),
+        MapSums.of(depth, reference, rays),
+    )
+
+
+def _table(scored: AlignedDepths, reference: Floats, spread: Floats) -> pa.Table:
+    """One row per pixel and method, the methods of a pixel together."""
+    n, count = len(reference), len(scored.methods)
+    depth, sigma = scored.depth_m.ravel(), scored.sigma_m.ravel()
+    return SCORES.from_columns(
+        {
+            "pair_id": np.repeat(scored.pair_id, count),
+            "frame_id": np.repeat(scored.frame_id, count),
+            "u": np.repeat(scored.pixels[:, 0], count),
+            "v": np.repeat(scored.pixels[:, 1], count),
+            "method": list(scored.methods) * n,
+            "depth_m": pa.array(depth, mask=~np.isfinite(depth)),
+            "sigma_depth_m": pa.array(sigma, mask=~np.isfinite(sigma)),
+            "reference_m": np.repeat(reference, count),
+            "reference_spread_m": np.repeat(spread, count).astype(np.float32),
+            "kept": scored.kept.ravel(),
+        }
+    )

@@ -1,0 +1,76 @@
+"""The scores of all frames together, as the object of `metrics.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.scoring.calibration import CalibrationSums, MapSums
+from pipeline.scoring.frame_scores import FrameScore
+from pipeline.scoring.metrics import MethodSums
+
+# Sums are exact to some 15 digits; what is written is the same on every machine.
+_DIGITS = 12
+
+
+def metrics_object(methods: Sequence[str], scores: Sequence[FrameScore]) -> dict[str, Any]:
+    """The object of `metrics.json`.
+
+    Args:
+        methods: Names, the published one first.
+        scores: One per frame, in order.
+
+    Returns:
+        `methods` (per method: all, common, kept_share, per_frame), `calibration` and `map`, both of the published one.
+        Where there is no pixel, null.
+    """
+    return {
+        "methods": {
+            name: {
+                **MethodSums.total(score.methods[m] for score in scores).metrics(),
+                "per_frame": [
+                    {"frame_id": score.frame_id, "n_scored": score.methods[m].n_scored, **score.methods[m].metrics()}
+                    for score in scores
+                ],
+            }
+            for m, name in enumerate(methods)
+        },
+        "calibration": {
+            "method": methods[0],
+            **CalibrationSums.total(score.calibration for score in scores).metrics(),
+        },
+        "map": {"method": methods[0], **MapSums.total(score.map for score in scores).metrics()},
+    }
+
+
+def to_json(value: dict[str, Any]) -> str:
+    """JSON with sorted keys and 12 significant digits, so that equal scores are equal bytes."""
+    return json.dumps(_rounded(value), indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def sentence(metrics: dict[str, Any]) -> str:
+    """The scores in a line for people: the published method beside the others, on the pixels all of them keep."""
+    published = metrics["calibration"]["method"]
+    others = [name for name in metrics["methods"] if name != published]
+    entry = metrics["methods"][published]
+    which = "common" if entry["common"]["n"] else "all"
+    against = ", ".join(f"{name} {_number(metrics['methods'][name][which]['abs_rel'])}" for name in others)
+    pixels = "pixels every method keeps" if which == "common" and others else "pixels"
+    return (
+        f"{published} AbsRel {_number(entry[which]['abs_rel'])}"
+        + (f" ({against})" if against else "")
+        + f" on {entry[which]['n']:,} {pixels}, {100.0 * (entry['kept_share'] or 0.0):.0f} % kept"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4f}"
+
+
+def _rounded(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value

@@ -1,0 +1,186 @@
+"""One photo: from a path to a record of everything its tags say, and what is wrong with it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import warnings
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from PIL import Image, UnidentifiedImageError
+
+from pipeline.engine.errors import InputError
+from pipeline.sources import dji
+from pipeline.sources.exif import Exif, read_exif
+from pipeline.sources.files import opened, stem
+from pipeline.sources.intrinsics import SourcedCamera, camera_of
+from pipeline.sources.xmp import Xmp, read_xmp
+
+# A larger file is no photo; it is not read into memory to find that out.
+_MAX_BYTES = 512 << 20
+# Enough for every aerial camera on the market; Pillow refuses to open more than twice its own limit (179 megapixels).
+_MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 89_478_485)
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoRecord:
+    """What is known of one photo.
+
+    Args:
+        location: Path or URL.
+        frame_id: Its stem.
+        sha256: Digest of the file's bytes, empty where it could not be read.
+        width: Pixels per row as stored, 0 where it could not be read.
+        height: Rows as stored.
+        make: Maker.
+        model: Model.
+        time: Exposure, UTC, on the camera's own clock.
+        time_source: Which tag the time came from.
+        position: Latitude and longitude.
+        attitude: Gimbal attitude.
+        absolute_m: AbsoluteAltitude, or EXIF's altitude, m, datum not known from the photo alone.
+        relative_m: Height above the take-off point, m.
+        fix: Quality of the position.
+        camera: Intrinsics at the file's size.
+        problem: Why it cannot be used, with the remedy; empty when it can.
+        notes: What to distrust although it can be used.
+    """
+
+    location: str
+    frame_id: str
+    sha256: str = ""
+    width: int = 0
+    height: int = 0
+    make: str = ""
+    model: str = ""
+    time: datetime | None = None
+    time_source: str = ""
+    position: dji.Position | None = None
+    attitude: dji.Attitude | None = None
+    absolute_m: float | None = None
+    relative_m: float | None = None
+    fix: dji.Fix = field(default_factory=dji.Fix)
+    camera: SourcedCamera | None = None
+    problem: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def read_photo(location: str, calibration: SourcedCamera | None = None) -> PhotoRecord:
+    """Reads a photo's tags and decodes its pixels once, at reduced size, to know that they are all there.
+
+    Args:
+        location: Path or URL.
+        calibration: The user's calibration, which wins over the photo's tags.
+
+    Returns:
+        The record; a photo that cannot be used has a problem and as much as could be read.
+
+    Raises:
+        InputError: The file is not there.
+        ResourceError: It may not be read.
+    """
+    with opened(location) as stream:
+        data = stream.read(_MAX_BYTES + 1)
+    name = stem(location)
+    if not data:
+        return PhotoRecord(location, name, problem="the file is empty (0 bytes): copy it again from the card")
+    if len(data) > _MAX_BYTES:
+        return PhotoRecord(location, name, problem=f"the file has more than {_MAX_BYTES >> 20} MiB: not a photo")
+    digest = hashlib.sha256(data).hexdigest()
+    try:
+        width, height, packet = _decoded(data)
+    except dji.Unusable as error:
+        return PhotoRecord(location, name, digest, problem=str(error))
+    notes: list[str] = []
+    exif, xmp = _tags(data, packet, notes)
+    return _record(
+        PhotoRecord(location, name, digest, width, height, exif.make, exif.model), exif, xmp, calibration, notes
+    )
+
+
+def _record(
+    base: PhotoRecord, exif: Exif, xmp: Xmp, calibration: SourcedCamera | None, notes: list[str]
+) -> PhotoRecord:
+    problems = [text] if (text := dji.rewritten(exif, xmp)) else []
+    time, time_source = dji.exposure_time(exif, xmp)
+    position = attitude = camera = None
+    try:
+        position = dji.position(exif, xmp)
+        notes.append(position.note)
+    except dji.Unusable as error:
+        problems.append(str(error))
+    try:
+        attitude = dji.attitude(exif, xmp)
+        notes.append(attitude.note)
+    except dji.Unusable as error:
+        problems.append(str(error))
+    try:
+        camera = camera_of(exif, xmp, base.width, base.height, calibration)
+    except dji.Unusable as error:
+        problems.append(str(error))
+    if exif.orientation not in {0, 1}:
+        notes.append(f"EXIF orientation {exif.orientation}: pixels are used as they are stored")
+    absolute = dji.number(xmp, "AbsoluteAltitude")
+    return PhotoRecord(
+        base.location, base.frame_id, base.sha256, base.width, base.height, base.make, base.model,
+        time=time,
+        time_source=time_source,
+        position=position,
+        attitude=attitude,
+        absolute_m=absolute if absolute is not None else exif.altitude_m,
+        relative_m=dji.number(xmp, "RelativeAltitude"),
+        fix=dji.fix(exif, xmp),
+        camera=camera,
+        problem="; ".join(problems),
+        notes=tuple(note for note in notes if note),
+    )  # fmt: skip
+
+
+def _decoded(data: bytes) -> tuple[int, int, bytes]:
+    """Size and XMP packet of an image whose pixels all decode.
+
+    Raises:
+        Unusable: Not an image, truncated, or too large to be one.
+    """
+    try:
+        with warnings.catch_warnings():
+            # Between one and two times its limit Pillow warns; the limit here is where it refuses.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as image:
+                width, height = image.size
+                packet = _packet(image)
+                # An eighth of the size still reads the file to its end, without holding all pixels.
+                image.draft("L", (max(1, width // 8), max(1, height // 8)))
+                image.load()
+    except Image.DecompressionBombError as error:
+        raise dji.Unusable(
+            f"more than {_MAX_PIXELS // 1_000_000} megapixels, not decoded: not an aerial photo"
+        ) from error
+    except UnidentifiedImageError as error:
+        raise dji.Unusable("not an image, whatever its name says: leave it out") from error
+    except (OSError, ValueError, SyntaxError, EOFError, LookupError, ArithmeticError, TypeError) as error:
+        # Pillow's decoders raise any of these on damaged bytes.
+        raise dji.Unusable(f"damaged or truncated ({error}): copy it again from the card") from error
+    return width, height, packet
+
+
+def _packet(image: Image.Image) -> bytes:
+    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return packet.encode("utf-8", "replace") if isinstance(packet, str) else bytes(packet)
+
+
+def _tags(data: bytes, packet: bytes, notes: list[str]) -> tuple[Exif, Xmp]:
+    try:
+        exif = read_exif(data)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - the per-item guard: the EXIF library names no set of errors for bad tags
+        notes.append(f"EXIF cannot be read ({type(error).__name__}: {error})")
+        exif = Exif()
+    try:
+        xmp = read_xmp(packet) if packet else Xmp()
+    except InputError as error:
+        notes.append(f"{error.message} ({error.found})")
+        xmp = Xmp()
+    return exif, xmp

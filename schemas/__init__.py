@@ -1,0 +1,37 @@
+"""The tables of a run folder: columns with type, unit, frame and meaning. Imports pyarrow and nothing of ours."""
+
+from schemas._columns import Column, SchemaError, TableSchema
+from schemas.cameras import CAMERAS
+from schemas.clocks import CLOCKS
+from schemas.depths import DEPTHS
+from schemas.frames import FRAMES
+from schemas.matches import MATCHES
+from schemas.pairs import PAIRS
+from schemas.points import POINTS
+from schemas.poses import POSES
+from schemas.relative_poses import RELATIVE_POSES
+from schemas.scores import SCORES
+from schemas.tracks import TRACKS
+
+TABLES: dict[str, TableSchema] = {
+    schema.name: schema
+    for schema in (CAMERAS, FRAMES, TRACKS, CLOCKS, PAIRS, MATCHES, RELATIVE_POSES, POSES, DEPTHS, POINTS, SCORES)
+}
+
+__all__ = [
+    "CAMERAS",
+    "CLOCKS",
+    "DEPTHS",
+    "FRAMES",
+    "MATCHES",
+    "PAIRS",
+    "POINTS",
+    "POSES",
+    "RELATIVE_POSES",
+    "SCORES",
+    "TABLES",
+    "TRACKS",
+    "Column",
+    "SchemaError",
+    "TableSchema",
+]

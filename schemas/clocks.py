@@ -1,0 +1,20 @@
+"""One row per clock: how a source's time is brought to UTC."""
+
+from schemas._columns import TableSchema, count, number, text
+
+CLOCKS = TableSchema(
+    "clocks",
+    1,
+    "Time bases of the sources and what ties them to UTC.",
+    (
+        text("clock_id", "Name of the clock."),
+        text("source", "What it times: photos, mrk."),
+        text("method", "How it is tied to UTC: stated by the file, stated by the user, or assumed UTC."),
+        number("offset_s", "s", "UTC minus the clock's own time."),
+        number("sigma_s", "s", "One sigma of the offset.", nullable=True),
+        number("drift_ppm", "1e-6", "Drift of the clock against UTC."),
+        number("residual_s", "s", "Root mean square of the anchors about the fit.", nullable=True),
+        count("anchors", "Events that tie the clock to UTC."),
+        text("problem", "What to distrust; empty when nothing was found."),
+    ),
+)

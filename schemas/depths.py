@@ -1,0 +1,25 @@
+"""One row per match, pair and method: depth in the ref frame with its sigma, kept or masked with the reason."""
+
+from schemas._columns import TableSchema, flag, number, single, text
+
+DEPTHS = TableSchema(
+    "depths",
+    1,
+    "Depths of the matches by every method.",
+    (
+        text("pair_id", "The pair in `pairs`."),
+        text("frame_id", "The ref frame, which the depth belongs to."),
+        number("u", "px", "Column in the ref image as given.", frame="image"),
+        number("v", "px", "Row in the ref image as given.", frame="image"),
+        text("method", "epitransfer (the virtual view of the configuration), epitransfer-lateral, epitransfer-vertical, dlt."),
+        number("depth_m", "m", "Distance along the optical axis of the ref camera; null when no finite depth exists.", frame="ref RDF", nullable=True),
+        number("sigma_depth_m", "m", "One sigma from pixel and pose covariance.", frame="ref RDF", nullable=True),
+        single("parallax_deg", "deg", "Angle between the two rays."),
+        single("transfer_angle_deg", "deg", "Angle between the two epipolar lines that meet in the virtual view.", nullable=True),
+        single("normal_x", "1", "Depth per metre by which the src ray is displaced at the point.", frame="ref RDF", nullable=True),
+        single("normal_y", "1", "As normal_x.", frame="ref RDF", nullable=True),
+        single("normal_z", "1", "As normal_x.", frame="ref RDF", nullable=True),
+        flag("kept", "Whether the depth may be published."),
+        text("reason", "Why it is masked; empty when kept."),
+    ),
+)

@@ -1,0 +1,21 @@
+"""One row per scored pixel and method: what was measured and what the truth says."""
+
+from schemas._columns import TableSchema, flag, number, single, text
+
+SCORES = TableSchema(
+    "pixels",
+    1,
+    "Depths beside the reference depth at the same pixel.",
+    (
+        text("pair_id", "The pair in `pairs`."),
+        text("frame_id", "The ref frame."),
+        number("u", "px", "Column in the ref image.", frame="image"),
+        number("v", "px", "Row in the ref image.", frame="image"),
+        text("method", "The method, as in `depths`."),
+        number("depth_m", "m", "Estimated depth.", frame="ref RDF", nullable=True),
+        number("sigma_depth_m", "m", "Its predicted sigma.", frame="ref RDF", nullable=True),
+        number("reference_m", "m", "Reference depth at the pixel.", frame="ref RDF"),
+        single("reference_spread_m", "m", "Spread of the reference about its local surface."),
+        flag("kept", "Whether the method keeps the depth."),
+    ),
+)

@@ -1,0 +1,142 @@
+"""The command line: lists the commands at once, loads a command's module when it is called, explains every error."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import sys
+from typing import Any
+
+import click
+import typer
+import typer.core
+import typer.main
+
+from pipeline.engine.errors import EpiTransferError, ResourceError
+from pipeline.engine.threads import limit_threads
+
+# Name: (module, function, help). The modules are heavy, so that --help does not load them.
+COMMANDS: dict[str, tuple[str, str, str]] = {
+    "run": ("stages.run", "command", "Run every stage of a workflow; what is up to date is skipped."),
+    "ingest": ("stages.stage_command", "ingest", "Read photos into frames, cameras, tracks and clocks."),
+    "pair": ("stages.stage_command", "pair", "Choose the pairs of frames that can give depth."),
+    "match": ("stages.stage_command", "match", "Find correspondences, guided by the logged pose."),
+    "refine": ("stages.stage_command", "refine", "Relative and absolute poses for the depths."),
+    "depth": ("stages.stage_command", "depth", "Sparse depth by epipolar transfer, with sigma."),
+    "fuse": ("stages.stage_command", "fuse", "Georeferenced points with covariance."),
+    "score": ("stages.stage_command", "score", "Depths against LiDAR tiles."),
+    "export": ("stages.export", "command", "Points in another format: laz, las, ply, gpkg, csv, parquet."),
+    "example": ("stages.example", "command", "Write a small synthetic flight with its truth."),
+    "inspect": ("stages.inspect", "command", "Tell what a photo folder, log, tile or table holds."),
+    "configure": ("stages.configure", "command", "Keep a workflow in a run folder, with each stage's slice for Make."),
+    "status": ("stages.status", "command", "Tell which stages are fresh, stale or missing, and why."),
+    "schema": ("stages.schema", "command", "Show the tables: column, type, unit, frame, meaning."),
+    "doctor": ("stages.doctor", "command", "Check versions, optional parts, PROJ grids, disk and memory."),
+}
+
+
+class _Deferred(click.Command):
+    """A command that is known by name and help until it is called."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        module, function, _ = COMMANDS[str(self.name)]
+        single = typer.Typer(add_completion=False, rich_markup_mode=None)
+        single.command(self.name, help=self.help)(getattr(importlib.import_module(module), function))
+        return typer.main.get_command(single).make_context(info_name, args, parent=parent, **extra)
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands in the order the data flows."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        del ctx
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        del ctx
+        return _Deferred(cmd_name, help=COMMANDS[cmd_name][2]) if cmd_name in COMMANDS else None
+
+
+# Plain help: rich's import alone would take a third of the time --help may take.
+app = typer.Typer(cls=_Commands, add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: bool = typer.Option(False, "--version", help="Show the version and leave."),
+) -> None:
+    """Metric depth from two drone frames and their logged poses, as georeferenced points with honest uncertainties."""
+    if version:
+        from importlib.metadata import version as installed  # noqa: PLC0415 - only here
+
+        typer.echo(installed("epitransfer"))
+        raise typer.Exit
+
+
+def main() -> None:
+    """The console command: runs it and turns every outcome into an exit code of the contract."""
+    limit_threads()
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Runs a command line.
+
+    Args:
+        arguments: Without the program's name.
+
+    Returns:
+        The exit code.
+    """
+    try:
+        command = typer.main.get_command(app)
+        return int(command.main(arguments, prog_name="epitransfer", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except EpiTransferError as error:
+        return _explain(error)
+    except (KeyboardInterrupt, click.Abort):
+        sys.stderr.write("interrupted; the same command carries on\n")
+        return 130
+    except MemoryError:
+        return _explain(ResourceError("E-RES-01", "out of memory", hint="use --jobs 1 or a smaller match.max_image_px"))
+    except BrokenPipeError:
+        # The reader of our output is gone (a pipe into head): not an error of ours, and nothing more can be said.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _explain(_resource(error)) if error.errno in _REASONS else _bug()
+    except Exception:  # noqa: BLE001 - the one boundary where everything ends
+        return _bug()
+
+
+_REASONS = {
+    errno.ENOSPC: ("E-RES-02", "the disk is full", "free some space; the same command carries on"),
+    errno.EDQUOT: ("E-RES-02", "the disk quota is used up", "free some space; the same command carries on"),
+    errno.EACCES: ("E-RES-03", "no permission", "check the owner and the mode of the folder"),
+    errno.EPERM: ("E-RES-03", "no permission", "check the owner and the mode of the folder"),
+    errno.EROFS: ("E-RES-03", "the file system is read-only", "write somewhere else"),
+    errno.ENOMEM: ("E-RES-01", "out of memory", "use --jobs 1 or a smaller match.max_image_px"),
+    errno.EFBIG: ("E-RES-02", "a file would be larger than allowed", "raise the limit (ulimit -f); the same command carries on"),
+    errno.ENOTDIR: ("E-RES-04", "not a folder", "give a folder"),
+}
+
+
+def _resource(error: OSError) -> ResourceError:
+    code, message, hint = _REASONS[error.errno or 0]
+    return ResourceError(code, message, where=str(error.filename or ""), found=str(error), hint=hint)
+
+
+def _explain(error: EpiTransferError) -> int:
+    sys.stderr.write(f"{error}\n")
+    return error.exit_code
+
+
+def _bug() -> int:
+    import traceback  # noqa: PLC0415 - slow to import, and rarely needed
+
+    sys.stderr.write(traceback.format_exc())
+    sys.stderr.write("error[E-BUG]: this is a bug; please report it with the lines above and the run's manifest.json\n")
+    return 1

@@ -1,0 +1,47 @@
+"""configure: keeps a workflow in a run folder, and each stage's slice of it for Make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.engine.config import load_workflow, parse_overrides, resolve, to_toml
+from pipeline.engine.digests import FileDigests
+from pipeline.engine.runfolder import RunFolder, write_json
+from stages.registry import MODELS, STAGES
+from stages.run import Set
+
+
+def command(
+    run: Annotated[Path, typer.Argument(help="Run folder; made if it is not there.")],
+    workflow: Annotated[Path, typer.Option(help="Workflow file (TOML).")],
+    set_: Set = None,
+) -> None:
+    """Writes RUN/workflow.toml, and RUN/.slices/STAGE.json for every stage whose keys or sources changed."""
+    layers = [(workflow.name, load_workflow(workflow, MODELS)), ("command line", parse_overrides(set_ or [], MODELS))]
+    configuration = resolve(layers, MODELS)
+    folder = RunFolder(run)
+    with folder.locked():
+        folder.workflow.write_text(to_toml(configuration.given), encoding="utf-8")
+        digests = FileDigests(folder.cache / "digests.json")
+        for name, config in configuration.sections.items():
+            stage = STAGES[name]
+            values = {f"{name}.{key}": value for key, value in config.model_dump(mode="json").items()}
+            values |= {key: configuration.value(key) for key in stage.reads}
+            _write_if_changed(
+                folder.root / ".slices" / f"{name}.json",
+                {"version": stage.version, "keys": values, "sources": digests.of_all(stage.sources(config))},
+            )
+        digests.save()
+
+
+def _write_if_changed(path: Path, value: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = path.with_name(f".{path.name}.new")
+    write_json(fresh, value)
+    if path.exists() and path.read_bytes() == fresh.read_bytes():
+        fresh.unlink()
+    else:
+        fresh.replace(path)

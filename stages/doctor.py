@@ -1,0 +1,56 @@
+"""doctor: what this machine has for a run, and what it lacks."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import pyproj
+import typer
+
+from pipeline.engine.executors import usable_cores
+
+REQUIRED = ("numpy", "scipy", "opencv-python-headless", "pyarrow", "pyproj", "laspy", "lazrs", "pydantic", "torch", "kornia")
+OPTIONAL = {"distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'"}
+GRIDS = {"egm96": "us_nga_egm96_15.tif", "egm2008": "us_nga_egm08_25.tif"}
+
+
+def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False) -> None:
+    """Checks versions, optional parts, PROJ grids, disk and memory."""
+    found = {
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in REQUIRED},
+        "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
+        "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(file) for name, file in GRIDS.items()}},
+        "cores": usable_cores(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "disk_free_gib": round(shutil.disk_usage(Path.cwd()).free / 2**30, 1),
+    }
+    if as_json:
+        typer.echo(json.dumps(found))
+        return
+    for name, value in found.items():
+        if isinstance(value, dict):
+            typer.echo(name)
+            for key, entry in value.items():
+                typer.echo(f"  {key:<24}{json.dumps(entry) if isinstance(entry, dict) else entry or 'missing'}")
+        else:
+            typer.echo(f"{name:<26}{value}")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _grid(file: str) -> str:
+    folders = pyproj.datadir.get_data_dir().split(os.pathsep) + [pyproj.datadir.get_user_data_dir()]
+    there = any((Path(folder) / file).exists() for folder in folders)
+    return "installed" if there else "missing: state ingest.geoid, or `projsync --file " + file + "`"

@@ -1,0 +1,28 @@
+"""example: a small synthetic flight with its truth, and a workflow that runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.engine.executors import usable_cores
+from pipeline.simulation.example import write_example
+
+
+def command(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write; absent or empty.")],
+    frames: Annotated[int, typer.Option(help="Number of photos, at least 4.")] = 24,
+    seed: Annotated[int, typer.Option(help="Seed of everything random; the same seed gives the same bytes.")] = 7,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; all cores by default.")] = None,
+) -> None:
+    """Writes a synthetic flight: photos with DJI tags, LiDAR tiles, control points, the truth, and a workflow."""
+    workers = jobs or usable_cores()
+    typer.echo(f"rendering {frames} photos on {workers} processors, some three seconds each", err=True)
+    made = write_example(directory, frames, seed, workers)
+    typer.echo(
+        f"{made.directory}: {made.frames} photos, {made.lidar_points} LiDAR returns, "
+        f"{made.control_observations} control point observations"
+    )
+    typer.echo(f"next: epitransfer run {directory / 'workflow.toml'} --out RUN", err=True)

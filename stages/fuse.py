@@ -1,0 +1,107 @@
+"""fuse: kept depths of all pairs as georeferenced points with covariance, merged by voxel, tiled."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from pipeline.engine.errors import NothingLeftError
+from pipeline.engine.stage import Context, Stage, StageConfig
+from pipeline.engine.tables import parquet_files, read_table
+from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
+from pipeline.geodesy.crs import output_crs
+from pipeline.geodesy.enu import LocalFrame
+from pipeline.points.geoparquet import TileFile, write_dataset
+from pipeline.points.observations import Scene, fused_tile, observations, spill
+from pipeline.points.stac import item
+
+
+class Config(StageConfig):
+    """How observations become points."""
+
+    voxel_m: float = Field(0.25, gt=0.0, description="Edge of the cube within which observations are one point (m)")
+    min_observations: int = Field(1, ge=1, description="Least number of pairs that saw a point (1)")
+    tile_m: int = Field(250, gt=0, description="Edge of a tile, a multiple of voxel_m (m)")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Config:
+        if abs(self.tile_m / self.voxel_m - round(self.tile_m / self.voxel_m)) > 1e-9:
+            raise ValueError("tile_m has to be a multiple of voxel_m")
+        return self
+
+
+def run(config: Config, context: Context) -> str:
+    """Places the points and merges them tile by tile; writes `points`."""
+    scene = _scene(context)
+    context.record("crs", scene.transform.crs.name)
+    context.record("heights", scene.transform.height_note)
+    spilled = context.scratch
+    parts = parquet_files(context.path("depths"))
+    place = partial(_place, scene, spilled, config.tile_m)
+    for _ in context.map(place, parts, shard=1, label="parts"):
+        pass
+    tiles = sorted(folder for folder in spilled.iterdir() if folder.is_dir())
+    merge = partial(_merge, scene, config, context.output("points"))
+    written = [tile for part in context.map(merge, tiles, shard=1, label="tiles") for tile in part]
+    rows = sum(tile.rows for tile in written)
+    if not rows:
+        raise NothingLeftError(
+            "E-FUSE-01", "no point was seen often enough", found=f"{len(tiles)} tiles of observations",
+            expected=f"points seen by {config.min_observations} pairs", hint="--set fuse.min_observations=1",
+        )
+    described = item(written, scene.transform.crs, "points", "Points by epipolar transfer, with covariance")
+    (context.output("points") / "item.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+    return f"{rows} points in {len(written)} tiles, {scene.transform.crs.name}"
+
+
+def _scene(context: Context) -> Scene:
+    frames = context.read("frames")
+    facts = context.facts("ingest")
+    usable = frames.filter(frames.column("usable"))
+    ids = usable.column("frame_id").to_pylist()
+    origin = LocalFrame(**facts["origin"])
+    transform = output_crs(
+        context.setting("ingest.crs"),
+        origin,
+        usable.column("height_datum")[0].as_py(),
+        context.setting("ingest.geoid"),
+        source_datum=facts["height_datum"],
+    )
+    images = usable.column("image").to_pylist()
+    return Scene(
+        {frame: f"{facts['photo_root']}/{image}" for frame, image in zip(ids, images, strict=True)},
+        dict(zip(ids, usable.column("time").cast("int64").to_pylist(), strict=True)),
+        camera_by_frame(frames, cameras_of(context.read("cameras"))),
+        poses_of(context.read("poses")),
+        {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
+        transform,
+        float(context.setting("match.sigma_px")),
+        context.setting("depth.methods")[0],
+    )
+
+
+def _place(scene: Scene, folder: Path, tile_m: int, files: Sequence[Path]) -> int:
+    for file in files:
+        spill(observations(scene, read_table(file, "depths")), folder, f"{file.stem}.arrow", tile_m)
+    return len(files)
+
+
+def _merge(scene: Scene, config: Config, output: Path, folders: Sequence[Path]) -> list[TileFile]:
+    tables = (fused_tile(scene, folder, config.voxel_m, config.min_observations, config.tile_m) for folder in folders)
+    return write_dataset(output, (table for table in tables if table.num_rows), scene.transform.crs)
+
+
+STAGE = Stage(
+    "fuse",
+    1,
+    Config,
+    ("frames", "cameras", "poses", "pairs", "depths"),
+    ("points",),
+    run,
+    reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px"),
+    facts_of=("ingest",),
+)

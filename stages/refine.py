@@ -1,0 +1,96 @@
+"""refine: the relative pose of each pair and the absolute poses that the points are placed with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from pipeline.engine.stage import Context, Stage, StageConfig
+from pipeline.engine.tables import parquet_files, read_table
+from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses_of, relative_pose_row, selected_pairs
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.poses import Pose, relative_pose
+from pipeline.matching.verify import epipolar_residuals
+from schemas import POSES, RELATIVE_POSES
+
+
+class Config(StageConfig):
+    """How the poses are refined."""
+
+    mode: Literal["none"] = Field("none", description="none passes the log's poses and their covariance on")
+
+
+def run(config: Config, context: Context) -> str:
+    """Passes the logged poses on and measures what the matches say of them; writes `relative_poses` and `poses`."""
+    frames = context.read("frames")
+    cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
+    poses = poses_of(frames)
+    sigma_px = float(context.setting("match.sigma_px"))
+    pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
+    rows = []
+    for file in parquet_files(context.path("matches")):
+        for pair_id, matches in by_pair(read_table(file, "matches")).items():
+            rows.append(_row(pairs[pair_id], matches, poses, cameras, sigma_px, config.mode))
+    context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
+    usable = frames.filter(frames.column("usable"))
+    context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
+    medians = [float(str(row["median_before_px"])) for row in rows if row["median_before_px"] is not None]
+    typical = f"{np.median(medians):.2f} px" if medians else "unknown"
+    context.record("median_epipolar_residual_px", round(float(np.median(medians)), 4) if medians else None)
+    return f"{len(rows)} pairs, median epipolar residual under the logged poses {typical}"
+
+
+def by_pair(matches: pa.Table) -> dict[str, pa.Table]:
+    """The rows of each pair, in the table's order."""
+    out: dict[str, pa.Table] = {}
+    ids = matches.column("pair_id").combine_chunks().dictionary_encode()
+    codes = ids.indices.to_numpy()
+    ends = np.flatnonzero(np.diff(codes, append=-1)) + 1
+    for start, end in zip(np.concatenate([[0], ends[:-1]]), ends, strict=True):
+        out[ids.dictionary[int(codes[start])].as_py()] = matches.slice(start, end - start)
+    return out
+
+
+def _row(
+    pair: PairRow,
+    matches: pa.Table,
+    poses: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    sigma_px: float,
+    mode: str,
+) -> dict[str, object]:
+    pose = relative_pose(poses[pair.ref], poses[pair.src])
+    kept = matches.filter(matches.column("inlier"))
+    residual: Floats = np.empty(0)
+    if kept.num_rows:
+        focal = cameras[pair.ref].focal_px
+        ref = cameras[pair.ref].rays(columns(kept, ("ref_u", "ref_v")))
+        src = cameras[pair.src].rays(columns(kept, ("src_u", "src_v"))) @ pose.rotation
+        residual = np.abs(epipolar_residuals(ref, src, pose, sigma_px / focal).angle_rad) * focal
+    rms = float(np.sqrt(np.mean(residual**2))) if residual.size else None
+    return {
+        **relative_pose_row(pair.pair_id, pose),
+        "n_matches": matches.num_rows,
+        "n_inliers": kept.num_rows,
+        "rms_before_px": rms,
+        "median_before_px": float(np.median(residual)) if residual.size else None,
+        "rms_after_px": rms,
+        "mode": mode,
+        "problem": "" if kept.num_rows else "no match agrees with the logged pose",
+    }
+
+
+STAGE = Stage(
+    "refine",
+    1,
+    Config,
+    ("frames", "cameras", "pairs", "matches"),
+    ("relative_poses", "poses"),
+    run,
+    reads=("match.sigma_px",),
+)

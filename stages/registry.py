@@ -1,0 +1,21 @@
+"""The stages in the order the data flows through them."""
+
+from __future__ import annotations
+
+from pipeline.engine.stage import Stage, StageConfig
+from stages import depth, fuse, ingest, match, pair, refine, score
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        ingest.STAGE,
+        pair.STAGE,
+        match.STAGE,
+        refine.STAGE,
+        depth.STAGE,
+        fuse.STAGE,
+        score.STAGE,
+    )
+}
+
+MODELS: dict[str, type[StageConfig]] = {name: stage.config for name, stage in STAGES.items()}

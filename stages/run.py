@@ -1,0 +1,65 @@
+"""run: every stage of a workflow, in order."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.engine.config import Sections, absolute_paths, load_workflow, parse_overrides, resolve
+from pipeline.engine.errors import UsageError
+from pipeline.engine.executors import usable_cores
+from pipeline.engine.runfolder import RunFolder
+from stages.registry import MODELS, STAGES
+from stages.workflow import chosen_stages, execute
+
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; repeatable.")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Processes; all cores by default.")]
+Scheduler = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to run the shards on.")]
+
+
+def command(
+    workflow: Annotated[Path | None, typer.Argument(help="Workflow file (TOML).")] = None,
+    out: Annotated[Path, typer.Option(help="Run folder; made, or carried on.")] = Path("run"),
+    set_: Set = None,
+    first: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="Run again from this stage.")] = None,
+    last: Annotated[str | None, typer.Option("--to", metavar="STAGE", help="Stop after this stage.")] = None,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    photos: Annotated[str | None, typer.Option(help="Photo folder, instead of a workflow.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera calibration YAML, with --photos.")] = None,
+    lidar: Annotated[str | None, typer.Option(help="LiDAR tiles to score against, with --photos.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Runs every stage the workflow has a section for; what is up to date is skipped."""
+    layers = [_sources(workflow, photos, camera, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
+    configuration = resolve(layers, MODELS)
+    if "ingest" not in configuration.sections:
+        raise UsageError("E-RUN-07", "the workflow has no [ingest] section", where=str(workflow), hint="add [ingest] photos")
+    names = chosen_stages(configuration, first, last)
+    folder = RunFolder(out)
+    records = execute(folder, configuration, names, jobs=jobs or usable_cores(), scheduler=scheduler, forced=first)
+    if as_json:
+        typer.echo(json.dumps({"run": str(folder.root), "stages": {k: v["summary"] for k, v in records.items()}}))
+    else:
+        typer.echo(f"{folder.root}: " + (list(records.values())[-1]["summary"] if records else "nothing to do"))
+
+
+def _sources(workflow: Path | None, photos: str | None, camera: str | None, lidar: str | None) -> tuple[str, Sections]:
+    given = {"photos": photos, "camera": camera, "lidar": lidar}
+    if workflow is not None:
+        if clash := [name for name, value in given.items() if value]:
+            raise UsageError(
+                "E-RUN-08", f"--{clash[0]} stands in for a workflow file, and one is given", found=str(workflow),
+                hint=f"use --set {'score.lidar' if clash[0] == 'lidar' else 'ingest.' + clash[0]}=...",
+            )
+        return workflow.name, load_workflow(workflow, MODELS)
+    if photos is None:
+        raise UsageError("E-RUN-09", "nothing to run", expected="WORKFLOW.toml or --photos DIR", hint="epitransfer run --help")
+    sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}
+    sections["ingest"] = {key: value for key, value in (("photos", photos), ("camera", camera)) if value}
+    if lidar:
+        sections["score"] = {"lidar": lidar}
+    return "command line", absolute_paths(sections, MODELS, Path.cwd())

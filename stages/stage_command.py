@@ -1,0 +1,69 @@
+"""One stage on a run folder: the commands `epitransfer STAGE RUN`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.engine.config import Sections, absolute_paths, load_workflow, parse_overrides, resolve
+from pipeline.engine.executors import usable_cores
+from pipeline.engine.runfolder import RunFolder
+from stages.registry import MODELS, STAGES
+from stages.run import Jobs, Scheduler, Set
+from stages.workflow import execute, kept_sections
+
+Run = Annotated[Path, typer.Argument(help="Run folder.")]
+
+
+def ingest(
+    run: Run,
+    workflow: Annotated[Path | None, typer.Option(help="Workflow file; kept in the run folder.")] = None,
+    photos: Annotated[str | None, typer.Option(help="Photo folder.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera calibration YAML.")] = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Reads the sources; takes them from a workflow file, the options, or the run folder."""
+    folder = RunFolder(run)
+    layers: list[tuple[str, Sections]] = []
+    if workflow is not None:
+        layers.append((workflow.name, load_workflow(workflow, MODELS)))
+    elif photos is None or folder.workflow.exists():
+        layers.append(("run folder", kept_sections(folder)))
+    else:
+        layers.append(("default", {name: {} for name in STAGES if name != "score"}))
+    given = {key: value for key, value in (("photos", photos), ("camera", camera)) if value}
+    layers.append(("command line", absolute_paths({"ingest": given}, MODELS, Path.cwd())))
+    _run("ingest", folder, layers, set_, jobs, scheduler)
+
+
+def _stage_command(name: str) -> Callable[..., None]:
+    def command(run: Run, set_: Set = None, jobs: Jobs = None, scheduler: Scheduler = None) -> None:
+        folder = RunFolder(run)
+        # A stage the kept workflow has no section for runs with its defaults.
+        _run(name, folder, [("default", {name: {}}), ("run folder", kept_sections(folder))], set_, jobs, scheduler)
+
+    command.__doc__ = f"Runs {name} with the configuration kept in the run folder."
+    return command
+
+
+def _run(
+    name: str,
+    folder: RunFolder,
+    layers: list[tuple[str, Sections]],
+    set_: list[str] | None,
+    jobs: int | None,
+    scheduler: str | None,
+) -> None:
+    configuration = resolve([*layers, ("command line", parse_overrides(set_ or [], MODELS))], MODELS)
+    records = execute(folder, configuration, [name], jobs=jobs or usable_cores(), scheduler=scheduler)
+    typer.echo(records[name]["summary"])
+
+
+pair, match, refine, depth, fuse, score = (
+    _stage_command(name) for name in ("pair", "match", "refine", "depth", "fuse", "score")
+)

@@ -1,0 +1,106 @@
+"""Running the stages of a configuration in order, and saying what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.engine.config import Configuration, Sections, load_workflow, resolve, to_toml
+from pipeline.engine.errors import TooManyFailuresError, UsageError
+from pipeline.engine.executors import executor_for
+from pipeline.engine.progress import Reporter
+from pipeline.engine.runfolder import RunFolder
+from pipeline.engine.runner import run_stage, staleness
+from stages.registry import MODELS, STAGES
+
+
+def kept_sections(folder: RunFolder) -> Sections:
+    """The configuration kept in a run folder.
+
+    Raises:
+        UsageError: The folder holds no run.
+    """
+    if not folder.workflow.exists():
+        raise UsageError(
+            "E-RUN-04", "this folder holds no run", where=str(folder.root), expected="a folder with workflow.toml",
+            hint="epitransfer run WORKFLOW.toml --out RUN, or epitransfer ingest RUN --workflow WORKFLOW.toml",
+        )
+    return load_workflow(folder.workflow, MODELS)
+
+
+def kept_configuration(folder: RunFolder) -> Configuration:
+    """The resolved configuration kept in a run folder."""
+    return resolve([("run folder", kept_sections(folder))], MODELS)
+
+
+def chosen_stages(configuration: Configuration, first: str | None, last: str | None) -> list[str]:
+    """The stages a workflow has sections for, between two of them.
+
+    Raises:
+        UsageError: A stage is unknown, or the workflow has no section for it.
+    """
+    names = [name for name in STAGES if name in configuration.sections]
+    for name in (first, last):
+        if name is not None and name not in names:
+            raise UsageError(
+                "E-RUN-05", f"the workflow has no stage {name}", expected=", ".join(names),
+                hint=f"add a section [{name}]" if name in STAGES else "one of the stages named",
+            )
+    begin = names.index(first) if first else 0
+    end = names.index(last) + 1 if last else len(names)
+    return names[begin:end]
+
+
+def execute(
+    folder: RunFolder,
+    configuration: Configuration,
+    names: Sequence[str],
+    *,
+    jobs: int,
+    scheduler: str | None = None,
+    forced: str | None = None,
+) -> dict[str, Any]:
+    """Runs stages, skipping what is up to date.
+
+    Args:
+        folder: The run folder.
+        configuration: Resolved.
+        names: Stages in order.
+        jobs: Processes.
+        scheduler: Address of a Dask scheduler.
+        forced: A stage that runs even if it is up to date.
+
+    Returns:
+        The record of each stage.
+
+    Raises:
+        TooManyFailuresError: All ran, but too many items failed.
+    """
+    reporter = Reporter()
+    records: dict[str, Any] = {}
+    with folder.locked(), executor_for(jobs, scheduler) as executor:
+        folder.workflow.write_text(to_toml(configuration.given), encoding="utf-8")
+        for name in names:
+            stage = STAGES[name]
+            record = folder.record(name)
+            if record and name != forced and staleness(stage, folder, configuration).status == "fresh":
+                folder.record_path(name).touch()
+                reporter.say(f"{name:<7}up to date: {record['summary']}")
+            else:
+                record = run_stage(stage, folder, configuration, executor, reporter)
+                reporter.say(f"{name:<7}{record['summary']} ({record['seconds']:.1f} s)")
+            records[name] = record
+    _check_failures(records, configuration)
+    return records
+
+
+def _check_failures(records: Mapping[str, Any], configuration: Configuration) -> None:
+    for name, record in records.items():
+        total, failed = record["items"]["total"], record["items"]["failed"]
+        allowed = configuration.sections[name].max_failed_share
+        if total and failed / total > allowed:
+            raise TooManyFailuresError(
+                "E-RUN-06", f"{name}: too many items failed; the run is finished all the same",
+                found=f"{failed} of {total}", expected=f"at most {allowed:.0%}",
+                hint=f"the reasons are in the tables; --set {name}.max_failed_share=1 accepts them",
+            )

@@ -1,0 +1,19 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with real photo sets; its absence is a failure where CI is set."""
+    folder = Path(os.environ.get("EPITRANSFER_SHARED", PROJECT.parent / "shared"))
+    if not (folder / "data").is_dir():
+        if os.environ.get("CI") and os.environ.get("EPITRANSFER_SHARED") is not None:
+            pytest.fail(f"EPITRANSFER_SHARED={folder} has no data folder")
+        pytest.skip(f"no real photo sets at {folder}")
+    return folder

@@ -98,7 +98,7 @@ def displacement_covariance(
 
 
 def best_plane(x_ref: Floats, x_src: Floats, pose: RelativePose, covariance: Floats) -> tuple[float, float, Floats]:
-    """Depth, variance and normal (scaled to 1 along the ref ray) of n_opt = P (P S P)^+ P r_t (METHOD: adaptive view)."""
+    """Depth, variance and normal (scaled to 1 along the ref ray) of the best plane, n = P (P S P)^+ P r_t."""
     d = np.array([*x_ref, 1.0])
     r = pose.rotation.T @ (*x_src, 1.0)
     p = np.eye(3) - np.outer(r, r) / (r @ r)

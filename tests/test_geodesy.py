@@ -70,8 +70,9 @@ class TestFrame:
     def test_enu_is_projs_topocentric(self) -> None:
         points = np.concatenate([ring(50.0), ring(3000.0)])
         chain = pyproj.Transformer.from_pipeline(
-            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
-            f"+lat_0={SITE.latitude_deg} +lon_0={SITE.longitude_deg} +h_0={SITE.height_m}"
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+            f"+step +proj=topocentric +ellps=WGS84 +lat_0={SITE.latitude_deg} +lon_0={SITE.longitude_deg} "
+            f"+h_0={SITE.height_m}"
         )
         lat, lon, h = SITE.geodetic_from_enu(points)
         oracle = np.stack(chain.transform(lon, lat, h), axis=-1)

@@ -226,7 +226,7 @@ class TestDataset:
 
     def test_damaged_files_are_named(self, tmp_path: Path) -> None:
         write_points(tmp_path / "points", synthetic_columns(500))
-        file = sorted((tmp_path / "points").iterdir())[0]
+        file = min((tmp_path / "points").iterdir())
         whole = file.read_bytes()
         for damaged in (whole[: len(whole) // 2], b"", b"PAR1 not parquet"):
             file.write_bytes(damaged)
@@ -238,7 +238,7 @@ class TestDataset:
 
     def test_damage_inside_a_row_group_is_an_input_error(self, tmp_path: Path) -> None:
         write_points(tmp_path / "points", synthetic_columns(500))
-        file = sorted((tmp_path / "points").iterdir())[0]
+        file = min((tmp_path / "points").iterdir())
         data = bytearray(file.read_bytes())
         data[4:2000] = bytes(1996)
         file.write_bytes(data)
@@ -276,9 +276,7 @@ class TestOtherPrograms:
 
     def test_gpio_spec(self, largest: Path) -> None:
         done = run_gpio("check", "spec", "--json", str(largest))
-        if "spatial" in done.stderr and not done.stdout.strip().startswith("{"):
-            pytest.skip("DuckDB's spatial extension is not installed here")
-        checks = json.loads(done.stdout)["checks"]
+        checks = json.loads(done.stdout[done.stdout.index("{") :])["checks"]
         failed = [check for check in checks if check["status"] == "failed"]
         # geoparquet-io holds that GEOMETRY belongs to 2.0; the files carry it on top of a complete 1.1.
         assert all("native" in json.dumps(check) for check in failed), failed
@@ -346,4 +344,7 @@ def run_gpio(*arguments: str) -> subprocess.CompletedProcess[str]:
     if gpio is None:
         pytest.skip("geoparquet-io is not installed")
     environment = os.environ | {"COLUMNS": "200", "NO_COLOR": "1"}
-    return subprocess.run([gpio, *arguments], capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run([gpio, *arguments], capture_output=True, text=True, check=False, env=environment)
+    if done.returncode and "spatial.duckdb_extension" in done.stderr + done.stdout:
+        pytest.skip("this check needs DuckDB's spatial extension, which is not installed here")
+    return done

@@ -163,8 +163,8 @@ def _toml_text(value: Any) -> str:
         return "[" + ", ".join(_toml_text(item) for item in value) + "]"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml_text(item)}" for key, item in value.items()) + " }"
-    # JSON's escapes are a subset of those of a TOML basic string.
-    return json.dumps(str(value), ensure_ascii=False)
+    # JSON's escapes are a subset of those of a TOML basic string, which wants DEL escaped too.
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _toml_value(text: str) -> Any:

@@ -218,7 +218,8 @@ def _determinant(jacobian: Floats) -> Floats:
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """The smallest positive real root, infinite without one."""
-    roots = polynomial.trim().roots()
+    # A leading coefficient next to nothing only adds roots next to infinity, and overflows on the way.
+    roots = polynomial.trim(1e-12).roots()
     real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
     return float(np.min(real[real > 0.0], initial=np.inf))
 

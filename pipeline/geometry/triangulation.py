@@ -23,9 +23,12 @@ def dlt_depth(ref_xy: Floats, src_xy: Floats, pose: RelativePose) -> Floats:
     """
     ref = np.eye(3, 4)
     src = np.concatenate([pose.rotation, pose.translation[:, None]], axis=1)
-    rows = [
-        xy[axis][:, None] * matrix[2] - matrix[axis] for xy, matrix in ((ref_xy, ref), (src_xy, src)) for axis in (0, 1)
-    ]
+    with np.errstate(invalid="ignore"):
+        rows = [
+            xy[axis][:, None] * matrix[2] - matrix[axis]
+            for xy, matrix in ((ref_xy, ref), (src_xy, src))
+            for axis in (0, 1)
+        ]
     system = np.stack(rows, axis=1)
     usable = np.all(np.isfinite(system), axis=(1, 2))
     depth = np.full(ref_xy.shape[1], np.nan)

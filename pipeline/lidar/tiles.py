@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import laspy
-import lazrs
 import numpy as np
 import pyproj
 
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bools, Floats
+from pipeline.lidar.public_header import check_public_header
 from pipeline.lidar.tile_crs import tile_crs
 
 CHUNK_POINTS = 1_000_000
 SUFFIXES = (".las", ".laz")
 # ASPRS LAS 1.4 R15, table 17: low point (noise), high noise.
 _NOISE_CLASSES = (7, 18)
-# What laspy and its decoder raise on bytes that are not a tile.
-_UNREADABLE = (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError, TypeError, struct.error, EOFError,
+# What laspy and its decoder (RuntimeError) raise on bytes that are not a tile.
+_UNREADABLE = (laspy.errors.LaspyException, RuntimeError, OSError, ValueError, TypeError, struct.error, EOFError,
                KeyError, IndexError, OverflowError, MemoryError)  # fmt: skip
 
 
@@ -102,6 +102,7 @@ def read_tile(path: Path, height_datum: str | None = None) -> Tile:
         InputError: Not a tile, or cut short.
         UndeterminedError: The CRS or its vertical part is not known.
     """
+    check_public_header(path)
     try:
         with laspy.open(path, read_evlrs=True) as reader:
             header = reader.header

@@ -158,10 +158,10 @@ def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range
 def _passes_z_buffer(camera: Camera, pixels: Floats, depth: Floats, footprint: Floats) -> Bools:
     """Drops returns that are alone or behind a depth edge, in bins as large as the returns are apart.
 
-    Near returns are further apart in pixels than far ones: bins double from level to level, every return enters every
-    level, and each is judged on the level of its own footprint.
+    Near returns are further apart in pixels than far ones: bins double from level to level. A return blocks on the level
+    of its own footprint, and is judged on that level and on those of all returns that may be nearer.
     """
-    keep = np.zeros(len(pixels), np.bool_)
+    keep = np.ones(len(pixels), np.bool_)
     if not len(pixels):
         return keep
     inverse = 1.0 / depth
@@ -170,29 +170,18 @@ def _passes_z_buffer(camera: Camera, pixels: Floats, depth: Floats, footprint: F
     level = np.clip(np.ceil(np.log2(bin_px / finest) - 1e-9), 0, _LEVELS - 1).astype(np.int64)
     for k in np.unique(level):
         size = finest * 2.0**k
-        columns, rows = int(camera.width // size) + 3, int(camera.height // size) + 3
-        cell = np.floor((pixels + 0.5) / size).astype(np.int64) + 1
-        flat = np.clip(cell[:, 0], 0, columns - 1) * rows + np.clip(cell[:, 1], 0, rows - 1)
-        mine = flat[level == k]
-        count = _around(np.bincount(flat, minlength=columns * rows).astype(np.float64), (columns, rows), "sum")
-        near, far = np.zeros(columns * rows), np.full(columns * rows, np.inf)
-        np.maximum.at(near, flat, inverse)
+        shape = int(camera.width // size) + 3, int(camera.height // size) + 3
+        cell = np.clip(np.floor((pixels + 0.5) / size).astype(np.int64) + 1, 0, (shape[0] - 1, shape[1] - 1))
+        flat = cell[:, 0] * shape[1] + cell[:, 1]
+        own, judged = level == k, level <= k
+        near, far = np.zeros(shape[0] * shape[1]), np.full(shape[0] * shape[1], np.inf)
+        np.maximum.at(near, flat[own], inverse[own])
         np.minimum.at(far, flat, inverse)
-        q = inverse[level == k]
-        rise = _around(near, (columns, rows), "max")[mine] - q
-        fall = q - _around(far, (columns, rows), "min")[mine]
-        edge = rise > np.maximum(_EDGE_SHARE * q, _EDGE_ASYMMETRY * fall)
-        keep[level == k] = (count[mine] >= _FEWEST_IN_BINS) & ~edge
+        q, at = inverse[judged], flat[judged]
+        rise = ndimage.maximum_filter(near.reshape(shape), 3).reshape(-1)[at] - q
+        fall = q - ndimage.minimum_filter(far.reshape(shape), 3).reshape(-1)[at]
+        keep[judged] &= rise <= np.maximum(_EDGE_SHARE * q, _EDGE_ASYMMETRY * fall)
+        count = np.bincount(flat, minlength=near.size).reshape(shape)
+        around = ndimage.convolve(count, np.ones((3, 3), np.int64), mode="constant").reshape(-1)
+        keep[own] &= around[flat[own]] >= _FEWEST_IN_BINS
     return keep
-
-
-def _around(values: Floats, shape: tuple[int, int], what: str) -> Floats:
-    """Sum, maximum or minimum over each bin and the eight around it, flat."""
-    grid = values.reshape(shape)
-    if what == "sum":
-        out: Floats = ndimage.uniform_filter(grid, 3, mode="constant") * 9.0
-    elif what == "max":
-        out = ndimage.maximum_filter(grid, 3, mode="nearest")
-    else:
-        out = ndimage.minimum_filter(grid, 3, mode="nearest")
-    return np.rint(out).reshape(-1) if what == "sum" else out.reshape(-1)

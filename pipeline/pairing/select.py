@@ -21,7 +21,7 @@ from pipeline.pairing.geometry import (
 )
 
 _BLOCK = 4096
-_REGION_GRID = 17
+_REGION_GRID = 13
 _OVERLAP_GRID = 6
 
 

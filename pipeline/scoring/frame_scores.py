@@ -150,7 +150,7 @@ def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: flo
     rays, focal = view.camera.rays(distinct), view.camera.focal_px
     found = reference_depth(distinct, focal * rays[:, :2], visible, focal * view.camera.rays(visible.pixels)[:, :2])
     valid = found.valid & (found.depth_m * np.linalg.norm(rays, axis=1) <= max_range_m)
-    # A pixel on a wall or a pole with few returns of its own takes its plane from what is seen behind: a column says so.
+    # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.
     points = view.centre_in_enu_m + (found.depth_m[:, None] * rays)[valid] @ view.rotation_enu_from_cam.T
     valid[valid] = ~behind_columns(view.centre_in_enu_m, points, near.field, max_range_m)
     back = back.ravel()

@@ -12,8 +12,10 @@ from pipeline.simulation.grid import HORIZONTAL_CRS, grid_from_enu
 from pipeline.simulation.site import Site
 
 # A surveyor marks a point only where its quarters can be told apart, and not at the image's border.
-_FARTHEST_M = 75.0
+_FARTHEST_M = 90.0
 _BORDER_PX = 25.0
+# All of the mark must be in sight, not only its middle: east and north of places on it, m.
+_ON_MARK_M = ((0.0, 0.0), (0.4, 0.4), (0.4, -0.4), (-0.4, -0.4), (-0.4, 0.4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +48,16 @@ def observe(site: Site, camera: Camera, true_poses: Trajectory) -> list[Observat
     """
     found: list[Observation] = []
     p = site.control_in_enu_m
+    level = [p[:, :2] + offset for offset in _ON_MARK_M]
+    marks = [np.column_stack([xy, site.terrain.height(xy[:, 0], xy[:, 1])]) for xy in level]
     rotations = true_poses.rotation_enu_from_cam
     for frame, centre in enumerate(true_poses.centre_in_enu_m):
         in_cam = (p - centre) @ rotations[frame]
         pixels = camera.project(in_cam)
         low, high = _BORDER_PX, np.array([camera.width, camera.height]) - 1.0 - _BORDER_PX
         clear = np.all((pixels > low) & (pixels < high), axis=1) & (np.linalg.norm(in_cam, axis=1) < _FARTHEST_M)
-        clear &= site.sees(centre, p)
+        for place in marks:
+            clear &= site.sees(centre, place)
         found += [Observation(int(k), frame, *map(float, pixels[k])) for k in np.flatnonzero(clear)]
     return sorted(found, key=lambda o: (o.point, o.frame))
 

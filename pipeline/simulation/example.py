@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.engine.errors import ResourceError, UsageError
 from pipeline.engine.executors import executor_for
+from pipeline.geometry.cameras import Camera
 from pipeline.simulation.control import gcp_list, observe
 from pipeline.simulation.flight import CONSUMER_DRONE, FEWEST_FRAMES, Trajectory, fly, frame_id, logged_poses
 from pipeline.simulation.grid import COMPOUND_CRS, navd88_height
@@ -79,10 +80,11 @@ class _Share:
     folder: Path
     seed: int
     frames: int
+    camera: Camera
     indices: tuple[int, ...]
 
 
-def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 1) -> Summary:
+def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 1, camera: Camera = CAMERA) -> Summary:
     """Writes the example; the folder appears complete or not at all.
 
     Args:
@@ -90,6 +92,7 @@ def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 
         frames: Number of photos, from `FEWEST_FRAMES`.
         seed: Of everything random.
         jobs: Processes; the bytes do not depend on it.
+        camera: The camera; a Brown model, for DewarpData.
 
     Returns:
         What was written.
@@ -98,17 +101,19 @@ def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 
         UsageError: The folder is not empty, or a number is out of range.
         ResourceError: The folder cannot be written.
     """
+    directory = directory.resolve()
     _check(directory, frames, seed, jobs)
     with _explained(directory):
         directory.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
         try:
             beside.chmod(0o755)
-            summary = _write(beside, directory, frames, seed, jobs)
+            shares = _shares(beside, frames, seed, jobs, camera)
+            observations, returns = _write(beside, shares)
             beside.rename(directory)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
-    return summary
+    return Summary(directory, frames, returns, observations)
 
 
 def logged(site: Site, poses: Trajectory, index: int) -> LoggedPose:
@@ -151,6 +156,13 @@ def _check(directory: Path, frames: int, seed: int, jobs: int) -> None:
             found=f"seed {seed}, jobs {jobs}",
             expected="--seed 0 or more, --jobs 1 or more",
         )
+    if directory == Path.cwd():
+        raise UsageError(
+            "E-EXAMPLE-05",
+            "the example cannot replace the folder you are in",
+            where=str(directory),
+            hint="name a folder in it: epitransfer example example",
+        )
     with _explained(directory):
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise UsageError(
@@ -178,26 +190,33 @@ def _explained(directory: Path) -> Iterator[None]:
         ) from error
 
 
-def _write(folder: Path, directory: Path, frames: int, seed: int, jobs: int) -> Summary:
+def _shares(folder: Path, frames: int, seed: int, jobs: int, camera: Camera) -> list[_Share]:
+    """Every `jobs`-th frame to the same process."""
+    count = min(jobs, frames)
+    return [_Share(folder, seed, frames, camera, tuple(range(first, frames, count))) for first in range(count)]
+
+
+def _write(folder: Path, shares: list[_Share]) -> tuple[int, int]:
+    """Writes everything; returns the numbers of control point observations and LiDAR returns."""
     for name in ("photos", "lidar", "truth/depth"):
         (folder / name).mkdir(parents=True)
-    shares = [_Share(folder, seed, frames, tuple(range(first, frames, jobs))) for first in range(min(jobs, frames))]
     with executor_for(len(shares)) as executor:
         for _ in executor.map(_render, shares):
             pass
-    site, true_poses = _scene(seed, frames)
+    camera = shares[0].camera
+    site, true_poses = _scene(shares[0].seed, shares[0].frames)
     returns = survey(site)
     write_tiles(site, returns, folder / "lidar")
-    observations = observe(site, CAMERA, true_poses)
+    observations = observe(site, camera, true_poses)
     texts = {
         "gcp_list.txt": gcp_list(site, observations),
         "truth/poses.csv": poses_csv(site, true_poses),
-        "truth/site.json": site_json(site, CAMERA, CONSUMER_DRONE, true_poses, observations),
+        "truth/site.json": site_json(site, camera, CONSUMER_DRONE, true_poses, observations),
         "workflow.toml": _WORKFLOW,
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
-    return Summary(directory, frames, len(returns.line), len(observations))
+    return len(observations), len(returns.line)
 
 
 def _scene(seed: int, frames: int) -> tuple[Site, Trajectory]:
@@ -208,11 +227,11 @@ def _scene(seed: int, frames: int) -> tuple[Site, Trajectory]:
 def _render(share: _Share) -> None:
     site, true_poses = _scene(share.seed, share.frames)
     logged_as = logged_poses(true_poses, CONSUMER_DRONE, share.seed)
-    renderer = Renderer(CAMERA, camera_rays(CAMERA), Shader.of(site))
+    renderer = Renderer(share.camera, camera_rays(share.camera), Shader.of(site))
     rotations = true_poses.rotation_enu_from_cam
     for index in share.indices:
         picture, depth = renderer.render(rotations[index], true_poses.centre_in_enu_m[index])
         image = exposed(picture, np.random.default_rng([share.seed, 6, index]))
         name = frame_id(index)
-        save_photo(share.folder / "photos" / f"{name}.JPG", image, CAMERA, logged(site, logged_as, index))
+        save_photo(share.folder / "photos" / f"{name}.JPG", image, share.camera, logged(site, logged_as, index))
         save_depth(share.folder / "truth" / "depth" / f"{name}.npz", depth)

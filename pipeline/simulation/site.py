@@ -32,7 +32,7 @@ _HILLS_M = (
     (150.0, -50.0, -2.4, 48.0),
     (15.0, 55.0, -1.0, 30.0),
 )
-_CONTROL = ((49.0, -33.0), (53.0, 2.0), (60.0, 46.0), (76.0, -33.0), (92.0, 27.0), (95.0, -2.0))
+_CONTROL = ((53.0, -37.5), (53.0, 2.0), (60.0, 46.0), (75.0, -37.5), (92.0, 27.0), (95.0, -2.0))
 _FOOTING_M = 2.0
 
 
@@ -41,7 +41,7 @@ class Hits:
     """What rays meet first.
 
     Args:
-        distance: (n,) multiples of the direction, inf for the sky; the depth where the direction's z is 1 in the camera.
+        distance: (n,) multiples of the direction, inf for the sky; the depth for directions with z = 1 in the camera.
         thing: (n,) SKY, GROUND, or the number of the solid.
         face: (n,) face of the solid, 0 elsewhere.
     """

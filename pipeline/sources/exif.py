@@ -16,6 +16,8 @@ import exifread
 logging.getLogger("exifread").addHandler(logging.NullHandler())
 
 Tags = Mapping[str, Any]
+# A photo's tags take some thousand reads, its MakerNotes up to 65,536; a damaged count asks for four thousand million.
+_MOST_READS = 300_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +74,12 @@ def read_exif(data: bytes) -> Exif:
     Returns:
         The tags; an empty record where there are none.
 
+    Raises:
+        ValueError: The tags are damaged; the library raises other exceptions, too.
+
     Source: CIPA DC-008 (EXIF 2.32); DJI MakerNotes tags 3 to 11 as ExifTool's DJI.pm names them.
     """
-    tags: Tags = exifread.process_file(io.BytesIO(data), details=True, extract_thumbnail=False)
+    tags: Tags = exifread.process_file(_Stream(data), details=True, extract_thumbnail=False)
     latitude_ref, longitude_ref = _text(tags, "GPS GPSLatitudeRef").upper(), _text(tags, "GPS GPSLongitudeRef").upper()
     return Exif(
         make=_text(tags, "Image Make"),
@@ -117,6 +122,19 @@ def utc_offset(text: str) -> timezone | None:
         return None
     ahead = timedelta(hours=int(hours), minutes=int(minutes))
     return timezone(ahead if text[0] == "+" else -ahead) if ahead < timedelta(hours=24) else None
+
+
+class _Stream(io.BytesIO):
+    """Bytes that refuse to be read forever."""
+
+    _reads = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any stream, so many times."""
+        self._reads += 1
+        if self._reads > _MOST_READS:
+            raise ValueError("a tag's count is longer than a file can be")
+        return super().read(size)
 
 
 def _numbers(tags: Tags, name: str) -> list[float]:
@@ -171,7 +189,8 @@ def _attitude(tags: Tags, names: tuple[str, str, str]) -> tuple[float, float, fl
     values = [_number(tags, f"MakerNote {name}") for name in names]
     if any(value is None for value in values):
         return None
-    yaw, pitch, roll = (float(value) for value in values if value is not None)
+    # Single precision in the file, written in tenths of a degree.
+    yaw, pitch, roll = (round(value, 4) for value in values if value is not None)
     return yaw, pitch, roll
 
 

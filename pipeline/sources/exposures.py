@@ -17,6 +17,8 @@ from pipeline.sources.photos import PhotoRecord
 # DJI_0012, DJI_20220525101750_0012_V, MAX_0012: the running number, with an optional letter for the sensor.
 _RUNNING_NUMBER = re.compile(r"_(\d{3,5})(?:_[A-Z]{1,2})?$")
 _SAME_TIME_S = 2.0
+# Time zones are whole quarters of an hour; a clock that is off by more could as well be numbers shifted by a photo.
+_QUARTER_S = 900.0
 # A photo's own position, rounded and without lever arm, is this near its exposure; a shifted assignment soon is not.
 _SAME_PLACE_M = 25.0
 _METRES_PER_DEGREE = 111_320.0
@@ -55,16 +57,17 @@ def running_number(frame_id: str) -> int | None:
     return int(found[1]) if found else None
 
 
-def associate(records: Sequence[PhotoRecord], files: Sequence[MarkFile]) -> Exposures:
+def associate(records: Sequence[PhotoRecord], files: Sequence[MarkFile], clock_offset_s: float = 0.0) -> Exposures:
     """Gives photos their exposure marks.
 
     A mark belongs to a photo of the same folder with the same running number, if all photos of the file agree with
-    their marks in time (within 2 s, up to one whole-second offset: photo clocks run in local time) and in place. Where
-    photos have no time the counts must agree. Order alone never decides: one lost frame would shift all that follow.
+    their marks in time (within 2 s, up to a time zone: photo clocks run in local time) and in place. Where photos have
+    no time the counts must agree. Order alone never decides: one lost frame would shift all that follow.
 
     Args:
         records: The photos.
         files: The mark files.
+        clock_offset_s: What the user adds to the photos' times, s.
 
     Returns:
         The marks of the photos that have one, and the reason for each file that was left aside.
@@ -79,7 +82,7 @@ def associate(records: Sequence[PhotoRecord], files: Sequence[MarkFile]) -> Expo
         several = sum(parent(other.location) == parent(file.location) for other in files) > 1
         pairs, problem = _pairs(photos, file.marks, several=several)
         if not problem:
-            offset, residual, problem = _agreement(pairs)
+            offset, residual, problem = _agreement(pairs, clock_offset_s)
         if problem:
             problems[file.location] = problem
             continue
@@ -121,7 +124,9 @@ def _pairs(
     return pairs, problem
 
 
-def _agreement(pairs: Sequence[tuple[PhotoRecord, Mark]]) -> tuple[float | None, float | None, str]:
+def _agreement(
+    pairs: Sequence[tuple[PhotoRecord, Mark]], clock_offset_s: float
+) -> tuple[float | None, float | None, str]:
     """The marks' time minus the photos', its spread, and why they cannot be the same exposures."""
     for photo, mark in pairs:
         if photo.position is not None and (apart := _apart_m(photo.position, mark)) > _SAME_PLACE_M:
@@ -130,11 +135,18 @@ def _agreement(pairs: Sequence[tuple[PhotoRecord, Mark]]) -> tuple[float | None,
     if not timed:
         return None, None, ""
     offset = float(round(median(difference for _, _, difference in timed)))
-    zoned = any(
+    stated = any(
         photo.time_source in {"utc_at_exposure", "exif+offset", "exif+gps zone", "gps"} for photo, _, _ in timed
     )
-    if zoned and abs(offset) > _SAME_TIME_S:
-        return None, None, f"photo times and exposure times are {offset:+.0f} s apart"
+    left = offset - clock_offset_s
+    if not (stated or clock_offset_s):
+        left -= _QUARTER_S * round(left / _QUARTER_S)
+    if abs(left) > _SAME_TIME_S:
+        return (
+            None,
+            None,
+            (f"photo times and exposure times are {left:+.0f} s apart beyond a time zone: set ingest.clock_offset_s"),
+        )
     for photo, mark, difference in timed:
         if abs(difference - offset) > _SAME_TIME_S:
             late = f"{difference - offset:+.1f} s"

@@ -68,7 +68,7 @@ def assemble(
         UndeterminedError: A geoid is needed and not known.
     """
     _check_unique(records)
-    found = exposures.associate(records, marks)
+    found = exposures.associate(records, marks, clock_offset_s)
     placed = [exposures.apply(record, found.of_photo.get(record.location)) for record in records]
     heights = datums.resolve(placed, height_datum, geoid)
     judged = [_judged(record, value, heights) for record, value in zip(placed, heights.values_m, strict=True)]

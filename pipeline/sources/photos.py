@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import struct
 import warnings
+import zlib
 from dataclasses import dataclass, field
 from datetime import datetime
 
@@ -21,6 +23,18 @@ from pipeline.sources.xmp import Xmp, read_xmp
 _MAX_BYTES = 512 << 20
 # Enough for every aerial camera on the market; Pillow refuses to open more than twice its own limit (179 megapixels).
 _MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 89_478_485)
+# What Pillow's decoders raise on damaged bytes.
+_DAMAGED = (
+    OSError,
+    ValueError,
+    SyntaxError,
+    EOFError,
+    LookupError,
+    ArithmeticError,
+    TypeError,
+    struct.error,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +159,8 @@ def _decoded(data: bytes) -> tuple[int, int, bytes]:
     """
     try:
         with warnings.catch_warnings():
-            # Between one and two times its limit Pillow warns; the limit here is where it refuses.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            # Pillow warns of odd tags, and of sizes between one and two times its limit; what matters here it raises.
+            warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(data)) as image:
                 width, height = image.size
                 packet = _packet(image)
@@ -159,8 +173,7 @@ def _decoded(data: bytes) -> tuple[int, int, bytes]:
         ) from error
     except UnidentifiedImageError as error:
         raise dji.Unusable("not an image, whatever its name says: leave it out") from error
-    except (OSError, ValueError, SyntaxError, EOFError, LookupError, ArithmeticError, TypeError) as error:
-        # Pillow's decoders raise any of these on damaged bytes.
+    except _DAMAGED as error:
         raise dji.Unusable(f"damaged or truncated ({error}): copy it again from the card") from error
     return width, height, packet
 

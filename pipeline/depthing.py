@@ -19,6 +19,7 @@ from pipeline.geometry.transfer import (
     variance_at,
 )
 from pipeline.geometry.triangulation import dlt_depth
+from pipeline.matching.images import PixelSigma
 
 METHODS = ("epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical")
 NO_DEPTH = "the rays do not meet in front of the cameras"
@@ -55,7 +56,7 @@ class MatchedRays:
 
     @classmethod
     def of(
-        cls, ref_px: Floats, src_px: Floats, ref_camera: Camera, src_camera: Camera, sigma_px: float
+        cls, ref_px: Floats, src_px: Floats, ref_camera: Camera, src_camera: Camera, sigma: PixelSigma
     ) -> MatchedRays:
         """Removes the lens distortion from pixels and from their noise.
 
@@ -64,10 +65,10 @@ class MatchedRays:
             src_px: (n, 2) pixels as given.
             ref_camera: Camera of ref.
             src_camera: Camera of src.
-            sigma_px: One sigma per axis.
+            sigma: Of the pixels.
         """
         ref, src = ref_camera.rays(ref_px), src_camera.rays(src_px)
-        noise = PixelNoise(_noise(ref_camera, ref, sigma_px), _noise(src_camera, src, sigma_px))
+        noise = PixelNoise(_noise(ref_camera, ref, sigma.of(ref_camera)), _noise(src_camera, src, sigma.of(src_camera)))
         return cls(np.ascontiguousarray(ref[:, :2].T), np.ascontiguousarray(src[:, :2].T), noise)
 
 

@@ -23,6 +23,7 @@ from pipeline.geometry.arrays import AnyArray, Bools, Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.transfer import VirtualView
+from pipeline.matching.images import PixelSigma
 from schemas import DEPTHS
 
 Method = Literal["epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"]
@@ -47,7 +48,7 @@ class Config(StageConfig):
 @dataclass(frozen=True, slots=True)
 class _Setting:
     config: Config
-    sigma_px: float
+    sigma: PixelSigma
     pairs: Mapping[str, PairRow]
     cameras: Mapping[str, Camera]
     poses: Mapping[str, RelativePose]
@@ -57,7 +58,7 @@ def run(config: Config, context: Context) -> str:
     """Computes the depths of all inliers, part by part; writes `depths`."""
     setting = _Setting(
         config,
-        float(context.setting("match.sigma_px")),
+        PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
         camera_by_frame(context.read("frames"), cameras_of(context.read("cameras"))),
         relative_poses_of(context.read("relative_poses")),
@@ -81,7 +82,7 @@ def _part(setting: _Setting, files: Sequence[Path]) -> pa.Table:
 def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
     pair, config = setting.pairs[pair_id], setting.config
     ref_px, src_px = columns(matches, ("ref_u", "ref_v")), columns(matches, ("src_u", "src_v"))
-    rays = MatchedRays.of(ref_px, src_px, setting.cameras[pair.ref], setting.cameras[pair.src], setting.sigma_px)
+    rays = MatchedRays.of(ref_px, src_px, setting.cameras[pair.ref], setting.cameras[pair.src], setting.sigma)
     limits = Limits(config.max_relative_sigma, config.max_range_m)
     view = VirtualView(config.virtual_view)
     return [
@@ -141,5 +142,5 @@ STAGE = Stage(
     ("frames", "cameras", "pairs", "matches", "relative_poses"),
     ("depths",),
     run,
-    reads=("match.sigma_px",),
+    reads=("match.sigma_px", "match.max_image_px"),
 )

@@ -15,6 +15,7 @@ from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geodesy.crs import output_crs
 from pipeline.geodesy.enu import LocalFrame
+from pipeline.matching.images import PixelSigma
 from pipeline.points.geoparquet import TileFile, write_dataset
 from pipeline.points.observations import Scene, fused_tile, observations, spill
 from pipeline.points.stac import item
@@ -79,7 +80,7 @@ def _scene(context: Context) -> Scene:
         poses_of(context.read("poses")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
         transform,
-        float(context.setting("match.sigma_px")),
+        PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px")),
         context.setting("depth.methods")[0],
     )
 
@@ -102,6 +103,6 @@ STAGE = Stage(
     ("frames", "cameras", "poses", "pairs", "depths"),
     ("points",),
     run,
-    reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px"),
+    reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px", "match.max_image_px"),
     facts_of=("ingest",),
 )

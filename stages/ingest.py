@@ -38,7 +38,7 @@ class Config(StageConfig):
     height_datum: str = Field(
         AUTO,
         description="What the photos' altitudes are measured from: ellipsoidal, egm96, egm2008, navd88, takeoff, "
-        "unknown; auto: ellipsoidal with RTK, else above take-off, else unknown",
+        "local (no tie to other data); auto: ellipsoidal with RTK, else above take-off, else unknown",
     )
     geoid: float | str | None = Field(
         None,

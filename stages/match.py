@@ -28,13 +28,13 @@ class Config(StageConfig):
     """How correspondences are found."""
 
     matcher: Literal["sift"] = Field("sift", description="Feature and matcher")
-    max_image_px: int = Field(2000, ge=64, description="Longest side an image is matched at (px)")
+    max_image_px: int = Field(1600, ge=64, description="Longest side an image is matched at (px)")
     max_features: int = Field(8192, ge=8, description="Most features per image (1)")
     ratio: float = Field(0.85, gt=0.0, le=1.0, description="Largest ratio of best to second-best distance in the band (1)")
     band_sigmas: float = Field(4.0, gt=0.0, description="Width of the epipolar band, in sigmas of pose and pixels (1)")
     nearest_m: float = Field(5.0, gt=0.0, description="Range of the nearest point looked for (m)")
-    sigma_px: float = Field(0.5, gt=0.0, description="One sigma of a matched position, per axis (px of the image as given)")
-    consensus_px: float = Field(1.5, gt=0.0, description="Largest residual from the pair's own epipolar geometry (px)")
+    sigma_px: float = Field(0.5, gt=0.0, description="One sigma of a matched position per axis, at the size matched at (px)")
+    consensus_px: float = Field(1.5, gt=0.0, description="Largest residual from the pair's own epipolar geometry, at the size matched at (px)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,9 @@ def run(config: Config, context: Context) -> str:
     extract = partial(_extract, images, extractor, context.cache)
     for _ in context.map(extract, wanted, shard=FEATURE_SHARD, label="images"):
         pass
-    limits = SearchLimits(Band(config.band_sigmas, config.sigma_px, config.nearest_m), config.ratio, config.consensus_px)
+    limits = SearchLimits(
+        Band(config.band_sigmas, config.sigma_px, config.nearest_m), config.ratio, config.consensus_px, config.max_image_px
+    )
     job = partial(_match, images, extractor, limits, context.cache)
     context.map_tables("matches", job, pairs, shard=PAIR_SHARD, label="pairs")
     found = inliers = 0

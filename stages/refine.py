@@ -15,6 +15,7 @@ from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, relative_pose
+from pipeline.matching.images import PixelSigma
 from pipeline.matching.verify import epipolar_residuals
 from schemas import POSES, RELATIVE_POSES
 
@@ -30,12 +31,12 @@ def run(config: Config, context: Context) -> str:
     frames = context.read("frames")
     cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
     poses = poses_of(frames)
-    sigma_px = float(context.setting("match.sigma_px"))
+    sigma = PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px"))
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
     rows = []
     for file in parquet_files(context.path("matches")):
         for pair_id, matches in by_pair(read_table(file, "matches")).items():
-            rows.append(_row(pairs[pair_id], matches, poses, cameras, sigma_px, config.mode))
+            rows.append(_row(pairs[pair_id], matches, poses, cameras, sigma, config.mode))
     context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
     usable = frames.filter(frames.column("usable"))
     context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
@@ -61,7 +62,7 @@ def _row(
     matches: pa.Table,
     poses: Mapping[str, Pose],
     cameras: Mapping[str, Camera],
-    sigma_px: float,
+    sigma: PixelSigma,
     mode: str,
 ) -> dict[str, object]:
     pose = relative_pose(poses[pair.ref], poses[pair.src])
@@ -69,9 +70,10 @@ def _row(
     residual: Floats = np.empty(0)
     if kept.num_rows:
         focal = cameras[pair.ref].focal_px
+        pixel_rad = sigma.of(cameras[pair.ref]) / focal
         ref = cameras[pair.ref].rays(columns(kept, ("ref_u", "ref_v")))
         src = cameras[pair.src].rays(columns(kept, ("src_u", "src_v"))) @ pose.rotation
-        residual = np.abs(epipolar_residuals(ref, src, pose, sigma_px / focal).angle_rad) * focal
+        residual = np.abs(epipolar_residuals(ref, src, pose, pixel_rad).angle_rad) * focal
     rms = float(np.sqrt(np.mean(residual**2))) if residual.size else None
     return {
         **relative_pose_row(pair.pair_id, pose),
@@ -92,5 +94,5 @@ STAGE = Stage(
     ("frames", "cameras", "pairs", "matches"),
     ("relative_poses", "poses"),
     run,
-    reads=("match.sigma_px",),
+    reads=("match.sigma_px", "match.max_image_px"),
 )

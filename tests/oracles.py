@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.poses import RelativePose
-from pipeline.geometry.rotations import skew
+from pipeline.geometry.rotations import ENU_FROM_NED, FRD_FROM_RDF, skew
 from pipeline.geometry.transfer import PixelNoise
 
 LATERAL: Floats = np.array([1.0, 0.0, 0.0])
 VERTICAL: Floats = np.array([0.0, 1.0, 0.0])
+
+
+def enu_from_gimbal(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Floats:
+    """enu_from_cam of a gimbal whose motors turn about the vertical, then the level forward axis, then the camera's right."""
+    return ENU_FROM_NED @ Rotation.from_euler("ZXY", [yaw_rad, roll_rad, pitch_rad]).as_matrix() @ FRD_FROM_RDF
 
 
 def fundamental(k: Floats, rotation_b_from_a: Floats, translation_b_from_a: Floats) -> Floats:

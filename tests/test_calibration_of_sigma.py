@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from oracles import enu_from_gimbal
 from scipy.stats import norm, qmc
 
 from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.poses import Pose, PoseSigmas, relative_pose
-from pipeline.geometry.rotations import enu_from_cam
 from pipeline.geometry.transfer import PixelNoise, VirtualView, transfer_with_sigma, variance_at
 from pipeline.geometry.triangulation import dlt_depth
 
@@ -57,7 +57,7 @@ class Errors:
 
 def scene(centres: Floats, rng: np.random.Generator) -> Floats:
     """(POINTS, 3) m ENU: half on the ground, half on things that stand on it, seen by both cameras within range."""
-    rotation, found = enu_from_cam(*ANGLES), np.zeros((0, 3))
+    rotation, found = enu_from_gimbal(*ANGLES), np.zeros((0, 3))
     half = np.array([WIDTH, HEIGHT]) / (2.0 * FOCAL_PX)
     while len(found) < POINTS:
         ray = np.append(rng.uniform(-half, half), 1.0) @ rotation.T
@@ -79,14 +79,14 @@ def redrawn(leg: str, seed: int) -> dict[str, Errors]:
     heading = ANGLES[0] + WAYS[leg] * DEG
     centres = np.array([[0.0, 0.0, ABOVE_GROUND_M]] * 2)
     centres[1, :2] = BASELINE_M * np.array([np.sin(heading), np.cos(heading)])
-    points, rotation = scene(centres, rng), enu_from_cam(*ANGLES)
+    points, rotation = scene(centres, rng), enu_from_gimbal(*ANGLES)
     ref, src = ((points - centre) @ rotation for centre in centres)
     noise, found = PixelNoise.isotropic(SIGMA_PX, FOCAL_PX), []
     for z in norm.ppf(qmc.Sobol(15, rng=rng).random(DRAWS)):
         common = z[:3] * COMMON.gimbal_rad
         logged = [
             Pose(
-                enu_from_cam(*(ANGLES + common + own[:3] * OWN.gimbal_rad)),
+                enu_from_gimbal(*(ANGLES + common + own[:3] * OWN.gimbal_rad)),
                 centre + own[3:] * OWN.position_m,
                 OWN,
                 COMMON,

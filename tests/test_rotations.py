@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from oracles import enu_from_gimbal
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.arrays import Floats
@@ -155,13 +156,37 @@ def test_skew_is_the_cross_product(v: Floats, w: Floats) -> None:
     np.testing.assert_allclose(skew(v) @ w, np.cross(v, w), atol=1e-14)
 
 
-@given(angles, pitches, angles)
-def test_gimbal_error_axes_are_the_derivatives_of_the_attitude(yaw: float, pitch: float, roll: float) -> None:
-    rotation, h = enu_from_cam(yaw, pitch, roll), 1e-6
-    for axis, step in zip(gimbal_error_axes(yaw, pitch).T, h * np.eye(3), strict=True):
-        later = enu_from_cam(yaw + step[0], pitch + step[1], roll + step[2])
-        sooner = enu_from_cam(yaw - step[0], pitch - step[1], roll - step[2])
+@given(angles, st.floats(-3.0, 3.0), st.floats(-1.4, 1.4))
+def test_gimbal_error_axes_are_the_derivatives_by_the_motors(yaw: float, pitch: float, roll: float) -> None:
+    rotation, h = enu_from_gimbal(yaw, pitch, roll), 1e-6
+    for axis, step in zip(gimbal_error_axes(rotation).T, h * np.eye(3), strict=True):
+        later = enu_from_gimbal(yaw + step[0], pitch + step[1], roll + step[2])
+        sooner = enu_from_gimbal(yaw - step[0], pitch - step[1], roll - step[2])
         np.testing.assert_allclose((later - sooner) / (2.0 * h) @ rotation.T, skew(axis), atol=1e-9)
+
+
+@given(angles, pitches)
+def test_without_roll_yaw_and_pitch_errors_are_those_of_the_angles(yaw: float, pitch: float) -> None:
+    rotation, h = enu_from_cam(yaw, pitch, 0.0), 1e-6
+    for axis, step in zip(gimbal_error_axes(rotation).T[:2], h * np.eye(3)[:2], strict=True):
+        later, sooner = (enu_from_cam(yaw + s * step[0], pitch + s * step[1], 0.0) for s in (1.0, -1.0))
+        np.testing.assert_allclose((later - sooner) / (2.0 * h) @ rotation.T, skew(axis), atol=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [0.0, -20.0, -90.0])
+def test_roll_errors_tilt_the_horizon_and_keep_three_axes_apart_straight_down(pitch: float) -> None:
+    axes = gimbal_error_axes(enu_from_cam(np.radians(70.0), np.radians(pitch), 0.0))
+    yaw = np.radians(70.0)
+    np.testing.assert_allclose(axes[:, 0], -UP)
+    np.testing.assert_allclose(axes[:, 1], (np.cos(yaw), -np.sin(yaw), 0.0), atol=1e-12)
+    np.testing.assert_allclose(axes[:, 2], (np.sin(yaw), np.cos(yaw), 0.0), atol=1e-12)
+
+
+def test_a_camera_on_its_side_has_some_level_roll_axis() -> None:
+    axes = gimbal_error_axes(np.stack([enu_from_cam(0.3, -0.2, np.pi / 2.0), enu_from_cam(0.0, 0.0, 0.0)]))
+    assert axes.shape == (2, 3, 3)
+    assert np.all(np.isfinite(axes))
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0, atol=1e-12)
 
 
 def test_the_ned_and_enu_axes_are_a_proper_rotation() -> None:

@@ -9,16 +9,16 @@ from pyproj.crs import CompoundCRS
 
 from pipeline.engine.errors import InputError, UndeterminedError, UsageError
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.heights import ELLIPSOIDAL, TAKEOFF, UNKNOWN, VERTICAL_EPSG
+from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF, VERTICAL_EPSG
 from pipeline.geodesy.transform import CrsTransform, read_crs
 
 OutputCrs = CrsTransform
 """What `output_crs` returns: the CRS and the way there and back."""
 
-# A vertical CRS of no register: its zero is wherever the drone took off. WKT 2 by ISO 19162:2019, 10.
-_TAKEOFF_WKT = (
-    'VERTCRS["height above take-off",VDATUM["take-off point"],'
-    'CS[vertical,1],AXIS["gravity-related height (H)",up],LENGTHUNIT["metre",1]]'
+# Vertical CRSs of no register, as WKT 2 (ISO 19162:2019, 10): zero is where the drone took off, or where the user says.
+_RELATIVE = {TAKEOFF: ("height above take-off", "take-off point"), LOCAL: ("local height", "local zero")}
+_VERTICAL_WKT = (
+    'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["gravity-related height (H)",up],LENGTHUNIT["metre",1]]'
 )
 _KEY = "ingest.crs"
 # A zone of UTM: projects that cross a zone's edge keep to one.
@@ -91,16 +91,18 @@ def with_vertical(horizontal: CRS, datum: str) -> CRS:
     """
     if datum == ELLIPSOIDAL:
         return horizontal.to_3d()
-    if datum == UNKNOWN or datum not in (TAKEOFF, *VERTICAL_EPSG):
+    if datum not in (*_RELATIVE, *VERTICAL_EPSG):
         raise UndeterminedError(
             "E-HEIGHT-08",
             "nothing says what the flight's heights are measured from, and the points need a vertical datum",
             where="ingest.height_datum",
             found=datum,
-            expected=", ".join((ELLIPSOIDAL, *VERTICAL_EPSG, TAKEOFF)),
-            hint="state it: --set ingest.height_datum=takeoff (or egm96, ellipsoidal, ...)",
+            expected=", ".join((ELLIPSOIDAL, *VERTICAL_EPSG, *_RELATIVE)),
+            hint="state it: --set ingest.height_datum=egm96 (or ellipsoidal, ...); local leaves the heights as logged, with no tie "
+            "to any other data",
         )
-    vertical = CRS.from_wkt(_TAKEOFF_WKT) if datum == TAKEOFF else CRS.from_epsg(VERTICAL_EPSG[datum])
+    relative = _RELATIVE.get(datum)
+    vertical = CRS.from_wkt(_VERTICAL_WKT.format(*relative)) if relative else CRS.from_epsg(VERTICAL_EPSG[datum])
     return CompoundCRS(f"{horizontal.name} + {vertical.name}", [horizontal, vertical])
 
 

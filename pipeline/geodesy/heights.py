@@ -19,10 +19,12 @@ from pyproj.transformer import TransformerGroup
 from pipeline.engine.errors import InputError, UndeterminedError, UsageError
 from pipeline.geometry.arrays import Floats
 
-ELLIPSOIDAL, TAKEOFF, UNKNOWN = "ellipsoidal", "takeoff", "unknown"
+ELLIPSOIDAL, TAKEOFF, LOCAL, UNKNOWN = "ellipsoidal", "takeoff", "local", "unknown"
+# Heights that are known against each other only: above the take-off point, or from a zero that the user knows.
+RELATIVE = (TAKEOFF, LOCAL)
 # Orthometric datums with a name of their own, and the EPSG code of their vertical CRS in metres.
 VERTICAL_EPSG: dict[str, int] = {"egm96": 5773, "egm2008": 3855, "navd88": 5703}
-DATUMS = (ELLIPSOIDAL, *VERTICAL_EPSG, TAKEOFF, UNKNOWN)
+DATUMS = (ELLIPSOIDAL, *VERTICAL_EPSG, *RELATIVE, UNKNOWN)
 _ALIASES = {"ellipsoid": ELLIPSOIDAL, "wgs84": ELLIPSOIDAL, "egm08": "egm2008", "take-off": TAKEOFF}
 # As PROJ's vertical datums are named, in lower case without punctuation; WKT 1 of LiDAR tiles often has no code.
 _DATUM_OF_NAME = {
@@ -31,6 +33,7 @@ _DATUM_OF_NAME = {
     "northamericanverticaldatum1988": "navd88",
     "navd88": "navd88",
     "takeoffpoint": TAKEOFF,
+    "localzero": LOCAL,
 }
 _REMEDY = (
     "--set ingest.geoid=METRES (the undulation here, h - H) or --set ingest.geoid=GRID (a PROJ grid file: GTX, GeoTIFF)"
@@ -66,7 +69,7 @@ def height_datum(text: str) -> str:
 
 def is_orthometric(datum: str) -> bool:
     """Whether heights of this datum need a geoid to become ellipsoidal ones."""
-    return datum not in (ELLIPSOIDAL, TAKEOFF, UNKNOWN)
+    return datum not in (ELLIPSOIDAL, *RELATIVE, UNKNOWN)
 
 
 def datum_of_vertical(vertical: CRS) -> str:

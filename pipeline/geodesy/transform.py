@@ -13,7 +13,7 @@ from pyproj.exceptions import ProjError
 
 from pipeline.engine.errors import InputError, UndeterminedError, UsageError
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.heights import ELLIPSOIDAL, TAKEOFF, UNKNOWN, Geoid, datum_of_vertical, is_orthometric
+from pipeline.geodesy.heights import ELLIPSOIDAL, RELATIVE, UNKNOWN, Geoid, datum_of_vertical, is_orthometric
 from pipeline.geometry.arrays import Floats
 
 # Half the step of the central differences: the grid's curvature is far below rounding over this length.
@@ -197,8 +197,8 @@ def _vertical_part(crs: CRS, stated: str) -> tuple[str, float]:
 
 
 def _refuse_unrelated(frame_datum: str, crs_datum: str, crs: CRS) -> None:
-    """Heights above take-off or of an unknown datum cannot be turned into any other."""
-    if UNKNOWN not in (frame_datum, crs_datum) and (frame_datum == TAKEOFF) == (crs_datum == TAKEOFF):
+    """Heights above take-off, from a local zero or of an unknown datum cannot be turned into any other."""
+    if frame_datum == crs_datum != UNKNOWN or not {frame_datum, crs_datum} & {*RELATIVE, UNKNOWN}:
         return
     raise UndeterminedError(
         "E-HEIGHT-06",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import Floats
-from pipeline.geometry.rotations import gimbal_angles, gimbal_error_axes, skew
+from pipeline.geometry.rotations import gimbal_error_axes, skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,7 @@ class Pose:
     @property
     def error_axes(self) -> Floats:
         """(3, 3): columns are the ENU axes about which yaw, pitch and roll errors turn the camera."""
-        yaw, pitch, _ = gimbal_angles(self.rotation)
-        return gimbal_error_axes(yaw, pitch)
+        return gimbal_error_axes(self.rotation)
 
 
 @dataclass(frozen=True, slots=True)

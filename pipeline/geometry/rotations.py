@@ -155,21 +155,24 @@ def gimbal_angles(rotation_enu_from_cam: Floats) -> Floats:
     return np.stack([yaw, pitch, roll], axis=-1)
 
 
-def gimbal_error_axes(yaw_rad: Floats | float, pitch_rad: Floats | float) -> Floats:
-    """The world axes about which small yaw, pitch and roll errors turn the camera.
+def gimbal_error_axes(rotation_enu_from_cam: Floats) -> Floats:
+    """The world axes about which small yaw, pitch and roll errors turn a camera on a gimbal.
 
-    A camera whose angles are off by (dyaw, dpitch, droll) is turned by the world rotation vector axes @ (dyaw, dpitch, droll).
+    A drone's gimbal turns about the vertical first, then about the level forward axis, then about the camera's own right
+    axis; those are the axes. Euler angles would not do: straight down, yaw and roll fall together, and no error would be
+    left about the level forward axis, which a gimbal has all the same.
 
     Args:
-        yaw_rad: (...) of the optical axis.
-        pitch_rad: (...) of the optical axis.
+        rotation_enu_from_cam: (..., 3, 3).
 
     Returns:
-        (..., 3, 3), columns the yaw, pitch and roll axis in ENU.
+        (..., 3, 3), columns the yaw, pitch and roll axis in ENU; a camera off by small angles (dyaw, dpitch, droll) is
+        turned by the world rotation vector axes @ (dyaw, dpitch, droll).
     """
-    yaw, pitch = np.broadcast_arrays(np.asarray(yaw_rad, np.float64), np.asarray(pitch_rad, np.float64))
-    zero = np.zeros_like(yaw)
-    down = np.stack([zero, zero, -np.ones_like(yaw)], axis=-1)
-    right = np.stack([np.cos(yaw), -np.sin(yaw), zero], axis=-1)
-    forward = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], axis=-1)
+    right = np.asarray(rotation_enu_from_cam, np.float64)[..., :, 0]
+    down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), right.shape)
+    forward = np.cross(np.array([0.0, 0.0, 1.0]), right)
+    # A camera rolled on its side has its right axis on the vertical; any level axis then serves for roll.
+    length = np.linalg.norm(forward, axis=-1, keepdims=True)
+    forward = np.where(length > 1e-9, forward / np.maximum(length, 1e-9), np.array([0.0, 1.0, 0.0]))
     return np.stack([down, right, forward], axis=-1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.engine.errors import InputError
 
-# LAS 1.4 R15, table 3: header size, offset to the points, number of VLRs, format, record length, legacy number of points.
+# LAS 1.4 R15, table 3: header size, offset to the points, VLRs, format, record length, legacy number of points.
 _COMMON = struct.Struct("<HIIBHI")
 _COMMON_AT = 94
 # Number of EVLRs and of points, from LAS 1.4 on.

@@ -158,8 +158,8 @@ def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range
 def _passes_z_buffer(camera: Camera, pixels: Floats, depth: Floats, footprint: Floats) -> Bools:
     """Drops returns that are alone or behind a depth edge, in bins as large as the returns are apart.
 
-    Near returns are further apart in pixels than far ones: bins double from level to level. A return blocks on the level
-    of its own footprint, and is judged on that level and on those of all returns that may be nearer.
+    Near returns are further apart in pixels than far ones: bins double from level to level. A return blocks on the
+    level of its own footprint, and is judged on that level and on those of all returns that may be nearer.
     """
     keep = np.ones(len(pixels), np.bool_)
     if not len(pixels):

@@ -64,7 +64,7 @@ def rays_in_ref(pixels: Floats, camera: Camera, rotation_ref_from_camera: Floats
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, focal_px: float) -> EpipolarAngles:
+def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, pixel_rad: float) -> EpipolarAngles:
     """Puts rays on their angles about the baseline, with the band's width for each.
 
     The error of `about` at a ray is that of the epipolar plane's turn: m . (a + e / range) with m the plane's normal, a the
@@ -74,7 +74,7 @@ def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, focal_px: floa
         rays: (n, 3) unit rays on the ref axes.
         pose: src_from_ref with its covariance.
         band: Of the search.
-        focal_px: Of the image.
+        pixel_rad: Angle of a pixel.
     """
     axis = pose.centre / np.linalg.norm(pose.centre)
     # Any fixed direction across the baseline serves as zero.
@@ -87,7 +87,7 @@ def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, focal_px: floa
     safe = np.maximum(across, 1e-6)
     normal = np.cross(axis, rays) / safe[:, None]
     in_plane = np.cross(normal, rays)
-    pixel = 2.0 * (band.sigma_px / focal_px) ** 2
+    pixel = 2.0 * (band.sigma_px * pixel_rad) ** 2
     width, slack = (
         band.sigmas * np.sqrt(_turn_variance(direction, rays, pose, band.nearest_m) + pixel)
         for direction in (normal, in_plane)

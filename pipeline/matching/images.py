@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bytes, Floats
+from pipeline.geometry.cameras import Camera
 
 
 def read_grey(path: Path | str) -> Bytes:
@@ -58,6 +60,23 @@ def shrunk_size(width: int, height: int, longest_px: int) -> tuple[int, int]:
     """The size an image is matched at: as it is, or its longer side brought to `longest_px`."""
     scale = min(1.0, longest_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+@dataclass(frozen=True, slots=True)
+class PixelSigma:
+    """How well positions are matched.
+
+    Args:
+        sigma_px: One sigma per axis, in pixels of the size the image is matched at.
+        longest_px: Longest side images are matched at.
+    """
+
+    sigma_px: float
+    longest_px: int
+
+    def of(self, camera: Camera) -> float:
+        """One sigma per axis in pixels of the image as given."""
+        return self.sigma_px * max(1.0, max(camera.width, camera.height) / self.longest_px)
 
 
 def to_full_pixels(pixels: Floats, shrunk: tuple[int, int], full: tuple[int, int]) -> Floats:

@@ -10,6 +10,7 @@ from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.features import Features
+from pipeline.matching.images import PixelSigma
 from pipeline.matching.guided import Band, epipolar_angles, match_guided, rays_in_ref
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
 
@@ -35,11 +36,17 @@ class SearchLimits:
         band: Of the epipolar search.
         ratio: Largest ratio of best to second-best distance.
         consensus_px: Largest residual from the pair's own epipolar geometry.
+        max_image_px: Longest side images are matched at; the limits in pixels are at that size.
     """
 
     band: Band
     ratio: float
     consensus_px: float
+    max_image_px: int
+
+    def pixel_rad(self, camera: Camera) -> float:
+        """The angle of one pixel at the size an image is matched at."""
+        return PixelSigma(1.0, self.max_image_px).of(camera) / camera.focal_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +80,8 @@ def match_pair(ref: PairImage, src: PairImage, pose: RelativePose, limits: Searc
     found = match_guided(
         root_sift(ref.features),
         root_sift(src.features),
-        epipolar_angles(ref_rays, pose, limits.band, ref.camera.focal_px),
-        epipolar_angles(src_rays, pose, limits.band, src.camera.focal_px),
+        epipolar_angles(ref_rays, pose, limits.band, limits.pixel_rad(ref.camera)),
+        epipolar_angles(src_rays, pose, limits.band, limits.pixel_rad(src.camera)),
         max_parallax_rad=_max_parallax(pose, limits.band.nearest_m),
         ratio=limits.ratio,
     )
@@ -82,13 +89,13 @@ def match_pair(ref: PairImage, src: PairImage, pose: RelativePose, limits: Searc
     keep = without_duplicates(ref_px, src_px, found.score)
     ref_px, src_px, score = ref_px[keep], src_px[keep], found.score[keep]
     ref_ray, src_ray = ref_rays[found.ref[keep]], src_rays[found.src[keep]]
-    residual = epipolar_residuals(ref_ray, src_ray, pose, limits.band.sigma_px / ref.camera.focal_px)
+    pixel_rad = limits.pixel_rad(ref.camera)
+    residual = epipolar_residuals(ref_ray, src_ray, pose, limits.band.sigma_px * pixel_rad)
     inlier = np.abs(residual.angle_rad) <= limits.band.sigmas * residual.sigma_rad
     agreeing = consensus(
         ref_ray[inlier, :2] / ref_ray[inlier, 2:],
         image_plane(src_ray[inlier] @ pose.rotation.T),
-        ref.camera.focal_px,
-        limits.consensus_px,
+        limits.consensus_px * pixel_rad,
     )
     inlier[inlier] = agreeing
     return PairMatches(ref_px, src_px, score, inlier)

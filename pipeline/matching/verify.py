@@ -81,7 +81,7 @@ def _ranges(ref_rays: Floats, src_unit: Floats, centre: Floats) -> Floats:
     return np.clip(np.where(found > 0.0, found, np.inf), 0.1 * length, 1000.0 * length)
 
 
-def consensus(ref_xy: Floats, src_xy: Floats, focal_px: float, threshold_px: float) -> Bools:
+def consensus(ref_xy: Floats, src_xy: Floats, threshold: float) -> Bools:
     """Matches that agree with one essential matrix (MAGSAC++).
 
     The essential matrix, not the fundamental: flat ground would leave the latter undetermined.
@@ -89,8 +89,7 @@ def consensus(ref_xy: Floats, src_xy: Floats, focal_px: float, threshold_px: flo
     Args:
         ref_xy: (n, 2) ideal image-plane coordinates.
         src_xy: (n, 2) ideal image-plane coordinates.
-        focal_px: Scale of the threshold.
-        threshold_px: Largest residual.
+        threshold: Largest residual, on the image plane.
 
     Returns:
         (n,).
@@ -103,7 +102,7 @@ def consensus(ref_xy: Floats, src_xy: Floats, focal_px: float, threshold_px: flo
         np.eye(3),
         cv2.USAC_MAGSAC,
         _SEED_CONFIDENCE,
-        threshold_px / focal_px,
+        threshold,
         _ITERATIONS,
     )
     if mask is None:

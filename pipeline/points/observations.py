@@ -16,7 +16,7 @@ from pipeline.geodesy.transform import CrsTransform
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose
-from pipeline.matching.images import read_colour
+from pipeline.matching.images import PixelSigma, read_colour
 from pipeline.points.geoparquet import tile_table
 from pipeline.points.merge import merge_voxels
 from pipeline.points.tiles import tile_corners, tile_name, tile_order
@@ -36,7 +36,7 @@ class Scene:
         poses: Pose of each frame.
         pairs: The pairs by name.
         transform: From ENU to the output CRS.
-        sigma_px: One sigma of a matched position.
+        sigma: Of the matched positions.
         method: The method whose points are published.
     """
 
@@ -46,7 +46,7 @@ class Scene:
     poses: Mapping[str, Pose]
     pairs: Mapping[str, PairRow]
     transform: CrsTransform
-    sigma_px: float
+    sigma: PixelSigma
     method: str
 
 
@@ -80,7 +80,7 @@ def _of_pair(scene: Scene, pair: PairRow, rows: pa.Table, picture: Bytes) -> pa.
     pixels, depth = columns(rows, ("u", "v")), np.asarray(column(rows, "depth_m"), np.float64)
     normal = columns(rows, ("normal_x", "normal_y", "normal_z"))
     camera, ref, src = scene.cameras[pair.ref], scene.poses[pair.ref], scene.poses[pair.src]
-    points = world_points(pixels, depth, normal, camera, ref, src, scene.sigma_px)
+    points = world_points(pixels, depth, normal, camera, ref, src, scene.sigma.of(camera))
     # Convergence and scale hardly change over one frame's view: the Jacobian at its camera serves all its points.
     jacobian = scene.transform.jacobian(ref.centre)
     own, common = (jacobian @ part @ jacobian.T for part in (points.own, points.common))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geodesy.heights import ELLIPSOIDAL, TAKEOFF, UNKNOWN, Geoid, height_datum, is_orthometric
+from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF, UNKNOWN, Geoid, height_datum, is_orthometric
 from pipeline.sources.dji import RTK_SINGLE
 from pipeline.sources.photos import PhotoRecord
 
@@ -21,7 +21,7 @@ class Heights:
 
     Args:
         values_m: One per photo, None where it has no height of this datum.
-        datum: What `values_m` are measured from: ellipsoidal, takeoff or unknown.
+        datum: What `values_m` are measured from: ellipsoidal, takeoff, local or unknown.
         stated: What the source's heights were measured from, before a geoid was added.
         why: How that was found, for the manifest.
     """
@@ -81,6 +81,8 @@ def resolve(records: Sequence[PhotoRecord], stated: str, geoid: float | str | No
 
 def _height(record: PhotoRecord, datum: str, *, automatic: bool) -> float | None:
     if datum == TAKEOFF:
+        return record.relative_m
+    if datum == LOCAL and record.absolute_m is None:
         return record.relative_m
     if automatic and datum == ELLIPSOIDAL and own_datum(record) != ELLIPSOIDAL:
         return None

@@ -9,6 +9,7 @@ matches stay the same, with the errors that they have, wrong ones too.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,15 +35,37 @@ from pipeline.flight import (  # noqa: E402
 )
 from pipeline.geometry.arrays import Bools, Floats, Ints  # noqa: E402
 from pipeline.geometry.poses import Pose, relative_pose  # noqa: E402
-from pipeline.geometry.rotations import enu_from_cam, gimbal_angles  # noqa: E402
+from pipeline.geometry.rotations import rotation_from_vector  # noqa: E402
 from pipeline.geometry.transfer import VirtualView  # noqa: E402
+from pipeline.matching.images import PixelSigma  # noqa: E402
 
 METHODS = {"adaptive": "epitransfer", "DLT": "dlt"}
 REDRAWS, MATCHES_PER_PAIR, SEED = 200, 100, 11
-SIGMA_PX = 0.5
-LIMITS = Limits(max_relative_sigma=0.25, max_range_m=100.0)
 # A match farther from the truth is wrong, not noisy.
 WRONG_PX = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the run was made with, from its manifest.
+
+    Args:
+        sigma: Of matched positions.
+        limits: What a published depth has to keep.
+    """
+
+    sigma: PixelSigma
+    limits: Limits
+
+    @classmethod
+    def of(cls, run: Path) -> Settings:
+        """The settings of a run."""
+        stages = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["stages"]
+        match, depth = ({k: v["value"] for k, v in stages[name]["config"].items()} for name in ("match", "depth"))
+        return cls(
+            PixelSigma(match["sigma_px"], match["max_image_px"]),
+            Limits(depth["max_relative_sigma"], depth["max_range_m"]),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +89,9 @@ class PairTruth:
     error_px: Floats
 
 
-def pairs_with_truth(run: Path, truth: FlightTruth, per_pair: int = MATCHES_PER_PAIR) -> list[PairTruth]:
+def pairs_with_truth(
+    run: Path, truth: FlightTruth, sigma: PixelSigma, per_pair: int = MATCHES_PER_PAIR
+) -> list[PairTruth]:
     """A random choice of every selected pair's inliers that have a truth."""
     frames = read_table(run / "frames.parquet", "frames")
     cameras = camera_by_frame(frames, cameras_of(read_table(run / "cameras.parquet", "cameras")))
@@ -89,7 +114,7 @@ def pairs_with_truth(run: Path, truth: FlightTruth, per_pair: int = MATCHES_PER_
                 pair,
                 truth.leg(pair.ref, pair.src),
                 truth.neighbours(pair.ref, pair.src),
-                MatchedRays.of(ref_px, src_px, camera, cameras[pair.src], SIGMA_PX),
+                MatchedRays.of(ref_px, src_px, camera, cameras[pair.src], sigma),
                 depth,
                 np.linalg.norm(error, axis=1),
             )
@@ -104,11 +129,28 @@ def redrawn_poses(
     common_m, common_rad = rng.normal(size=3), rng.normal(size=3)
     out = {}
     for name, pose in logged.items():
+        own_m, own_rad = rng.normal(size=3), rng.normal(size=3)
+        shift = own_m * pose.own.position_m + common_m * pose.common.position_m
+        turn = own_rad * pose.own.gimbal_rad + common_rad * pose.common.gimbal_rad
         true = truth[name]
-        own_m, own_rad = rng.normal(size=3) * pose.own.position_m, rng.normal(size=3) * pose.own.gimbal_rad
-        angles = gimbal_angles(true.rotation) + own_rad + common_rad * pose.common.gimbal_rad
-        centre = true.centre + own_m + common_m * pose.common.position_m
-        out[name] = Pose(enu_from_cam(*angles), centre, pose.own, pose.common)
+        out[name] = Pose(turned(true.rotation, turn), true.centre + shift, pose.own, pose.common)
+    return out
+
+
+def turned(rotation: Floats, turn_rad: Floats) -> Floats:
+    """An attitude (enu_from_cam) off by yaw, pitch and roll as `frames` defines them, written without the closed form.
+
+    Yaw is about the vertical, pitch about the camera's right axis, roll about the level forward axis.
+    """
+    yaw, pitch, roll = turn_rad
+    level_forward = np.cross([0.0, 0.0, 1.0], rotation[:, 0])
+    level_forward /= np.linalg.norm(level_forward)
+    out: Floats = (
+        rotation_from_vector(np.array([0.0, 0.0, -yaw]))
+        @ rotation_from_vector(roll * level_forward)
+        @ rotation
+        @ rotation_from_vector(np.array([pitch, 0.0, 0.0]))
+    )
     return out
 
 
@@ -150,7 +192,7 @@ class Outcome:
 
 
 def outcomes(
-    pairs: Sequence[PairTruth], truth: FlightTruth, logged: Mapping[str, Pose], redraws: int
+    pairs: Sequence[PairTruth], truth: FlightTruth, logged: Mapping[str, Pose], limits: Limits, redraws: int
 ) -> dict[str, Outcome]:
     """Every method over the same redraws."""
     rng = np.random.default_rng([SEED, 1])
@@ -165,7 +207,7 @@ def outcomes(
             start = part.stop
             pose = relative_pose(poses[pair.pair.ref], poses[pair.pair.src])
             for name, method in METHODS.items():
-                found = depths_by(method, VirtualView.ADAPTIVE, 1.0, pair.rays, pose, LIMITS)
+                found = depths_by(method, VirtualView.ADAPTIVE, 1.0, pair.rays, pose, limits)
                 error, sigma, kept = stacks[name]
                 error[k, part] = found.depths.depth_m - pair.depth_m
                 sigma[k, part] = np.sqrt(found.depths.variance_m2)
@@ -193,26 +235,25 @@ def lines(found: Mapping[str, Outcome], pairs: Sequence[PairTruth]) -> Iterator[
         for name, outcome in found.items():
             rows = chosen[outcome.pair]
             one, two = outcome.within(1.0, rows), outcome.within(2.0, rows)
-            yield (
-                f"{title:26}{name:10}{one[0]:8.1%} +-{one[1]:5.1%}{two[0]:8.1%} +-{two[1]:5.1%}"
-                f"{np.mean(outcome.kept[:, rows]):9.1%}{outcome.abs_rel(rows, common):9.4f}{np.mean(outcome.wrong[rows]):8.2%}"
-            )
+            shares = f"{one[0]:8.1%} +-{one[1]:5.1%}{two[0]:8.1%} +-{two[1]:5.1%}{np.mean(outcome.kept[:, rows]):9.1%}"
+            rest = f"{outcome.abs_rel(rows, common):9.4f}{np.mean(outcome.wrong[rows]):8.2%}"
+            yield f"{title:26}{name:10}{shares}{rest}"
 
 
 def main(example: Path, run: Path, redraws: int) -> None:
     """Prints the table."""
     truth = FlightTruth.of(example)
     logged = poses_of(read_table(run / "frames.parquet", "frames"))
-    pairs = pairs_with_truth(run, truth)
-    found = outcomes(pairs, truth, logged, redraws)
+    settings = Settings.of(run)
+    pairs = pairs_with_truth(run, truth, settings.sigma)
+    found = outcomes(pairs, truth, logged, settings.limits, redraws)
     print(f"Kept depths within the predicted sigma, over {redraws} redraws of the pose error that `frames` states,")
     print(f"on {len(pairs)} pairs x {MATCHES_PER_PAIR} of the run's matches; a Gaussian error has 68.3 % and 95.4 %\n")
     print(f"{'':36}{'1 sigma':>16}{'2 sigma':>16}{'kept':>9}{'AbsRel':>9}{'wrong':>8}")
     for line in lines(found, pairs):
         print(line)
-    print(
-        f"AbsRel is over what both keep; wrong: matches more than {WRONG_PX:g} px from the truth, which are in the figures."
-    )
+    print("AbsRel is over what both keep. Wrong are matches more than")
+    print(f"{WRONG_PX:g} px from the truth; they are in the figures.")
 
 
 if __name__ == "__main__":

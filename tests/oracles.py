@@ -15,7 +15,7 @@ VERTICAL: Floats = np.array([0.0, 1.0, 0.0])
 
 
 def enu_from_gimbal(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Floats:
-    """enu_from_cam of a gimbal whose motors turn about the vertical, then the level forward axis, then the camera's right."""
+    """enu_from_cam of a gimbal that turns about the vertical, then the level forward axis, then the camera's right."""
     return ENU_FROM_NED @ Rotation.from_euler("ZXY", [yaw_rad, roll_rad, pitch_rad]).as_matrix() @ FRD_FROM_RDF
 
 

@@ -167,8 +167,8 @@ def test_the_roll_180_form_has_the_same_covariance() -> None:
     np.testing.assert_allclose(relative_pose(other, src).covariance, relative_pose(ref, src).covariance, atol=1e-15)
 
 
-def test_skew_order_of_the_lever_arm() -> None:
-    """Only ref's own roll: its axis is level and forward, so the src centre swings about it by the lever arm across it."""
+def test_src_swings_about_ref_by_its_lever_arm() -> None:
+    """Only ref's own roll: its axis is level and forward, and the src centre swings about it."""
     roll = PoseSigmas(np.zeros(3), np.array([0.0, 0.0, 1.0]) * DEG)
     found = relative_pose(pose(REF_ANGLES, REF_CENTRE, roll, NONE), pose(SRC_ANGLES, SRC_CENTRE, NONE, NONE))
     forward = DEG * enu_from_gimbal(*REF_ANGLES).T @ (np.sin(REF_ANGLES[0]), np.cos(REF_ANGLES[0]), 0.0)

@@ -36,6 +36,10 @@ class Band:
     sigma_px: float
     nearest_m: float
 
+    def nearest_for(self, pose: RelativePose) -> float:
+        """The nearest range for a pair: a point nearer than the baseline turns by 60 deg or more, which no feature bears."""
+        return max(self.nearest_m, float(np.linalg.norm(pose.centre)))
+
 
 @dataclass(frozen=True, slots=True)
 class EpipolarAngles:
@@ -89,7 +93,7 @@ def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, pixel_rad: flo
     in_plane = np.cross(normal, rays)
     pixel = 2.0 * (band.sigma_px * pixel_rad) ** 2
     width, slack = (
-        band.sigmas * np.sqrt(_turn_variance(direction, rays, pose, band.nearest_m) + pixel)
+        band.sigmas * np.sqrt(_turn_variance(direction, rays, pose, band.nearest_for(pose)) + pixel)
         for direction in (normal, in_plane)
     )
     return EpipolarAngles(np.where(width / safe < _WIDEST_BAND, about, np.nan), along, width / safe, slack)

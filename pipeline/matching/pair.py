@@ -82,7 +82,7 @@ def match_pair(ref: PairImage, src: PairImage, pose: RelativePose, limits: Searc
         root_sift(src.features),
         epipolar_angles(ref_rays, pose, limits.band, limits.pixel_rad(ref.camera)),
         epipolar_angles(src_rays, pose, limits.band, limits.pixel_rad(src.camera)),
-        max_parallax_rad=_max_parallax(pose, limits.band.nearest_m),
+        max_parallax_rad=_max_parallax(pose, limits.band.nearest_for(pose)),
         ratio=limits.ratio,
     )
     ref_px, src_px = ref.features.pixels[found.ref], src.features.pixels[found.src]

@@ -34,7 +34,13 @@ def cameras_of(table: pa.Table) -> dict[str, Camera]:
     """The cameras of the `cameras` table by camera_id."""
     return {
         row["camera_id"]: Camera(
-            row["model"], row["width"], row["height"], row["fx"], row["fy"], row["cx"], row["cy"],
+            row["model"],
+            row["width"],
+            row["height"],
+            row["fx"],
+            row["fy"],
+            row["cx"],
+            row["cy"],
             tuple(row["distortion"]),
         )
         for row in table.to_pylist()

@@ -18,6 +18,8 @@ CAMERAS = TableSchema(
         number("cx", "px", "Principal point, column; pixel (0, 0) is the centre of the top-left pixel.", frame="image"),
         number("cy", "px", "Principal point, row.", frame="image"),
         Column("distortion", pa.list_(pa.float64()), "Distortion coefficients in OpenCV's order; empty for none.", "1"),
-        text("source", "Where the intrinsics came from: calibration file, DewarpData, calibrated focal length, or EXIF."),
+        text(
+            "source", "Where the intrinsics came from: calibration file, DewarpData, calibrated focal length, or EXIF."
+        ),
     ),
 )

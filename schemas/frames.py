@@ -46,15 +46,27 @@ FRAMES = TableSchema(
         text("image_sha256", "Digest of the image file's bytes."),
         text("camera_id", "The camera in `cameras`; empty when the image could not be read."),
         time_ns("time", "Exposure.", nullable=True),
-        text("time_source", "Which tag the time and its zone came from: utc_at_exposure, mrk, gps, exif+offset, exif+gps zone, exif (zone unknown)."),
+        text(
+            "time_source",
+            "Which tag the time and its zone came from: utc_at_exposure, mrk, gps, exif+offset, exif+gps zone, exif (zone unknown).",
+        ),
         number("latitude_deg", "deg", "Camera centre, WGS 84.", frame="EPSG:4979", nullable=True),
         number("longitude_deg", "deg", "Camera centre, WGS 84.", frame="EPSG:4979", nullable=True),
-        number("height_m", "m", "Camera centre above the ellipsoid when height_datum is ellipsoidal; else the height as logged.", nullable=True),
+        number(
+            "height_m",
+            "m",
+            "Camera centre above the ellipsoid when height_datum is ellipsoidal; else the height as logged.",
+            nullable=True,
+        ),
         text("height_datum", "What height_m is measured from: ellipsoidal, takeoff, local or unknown."),
-        number("above_takeoff_m", "m", "Height above the take-off point as the log says it, where it does.", nullable=True),
+        number(
+            "above_takeoff_m", "m", "Height above the take-off point as the log says it, where it does.", nullable=True
+        ),
         *position_columns(),
         number("yaw_deg", "deg", "Optical axis, clockwise from true north.", frame="NED", nullable=True),
-        number("pitch_deg", "deg", "Optical axis above the horizon; -90 looks straight down.", frame="NED", nullable=True),
+        number(
+            "pitch_deg", "deg", "Optical axis above the horizon; -90 looks straight down.", frame="NED", nullable=True
+        ),
         number("roll_deg", "deg", "Rotation about the optical axis, clockwise positive.", frame="NED", nullable=True),
         *sigma_columns(),
         text("pose_source", "Which tags position and attitude came from."),

@@ -13,6 +13,8 @@ MATCHES = TableSchema(
         number("src_u", "px", "Column in the src image.", frame="image"),
         number("src_v", "px", "Row in the src image.", frame="image"),
         single("score", "1", "1 minus the ratio of best to second-best descriptor distance; higher is better."),
-        flag("inlier", "Agrees with the logged pose within its covariance and with the epipolar geometry of the matches."),
+        flag(
+            "inlier", "Agrees with the logged pose within its covariance and with the epipolar geometry of the matches."
+        ),
     ),
 )

@@ -119,7 +119,11 @@ _REASONS = {
     errno.EPERM: ("E-RES-03", "no permission", "check the owner and the mode of the folder"),
     errno.EROFS: ("E-RES-03", "the file system is read-only", "write somewhere else"),
     errno.ENOMEM: ("E-RES-01", "out of memory", "use --jobs 1 or a smaller match.max_image_px"),
-    errno.EFBIG: ("E-RES-02", "a file would be larger than allowed", "raise the limit (ulimit -f); the same command carries on"),
+    errno.EFBIG: (
+        "E-RES-02",
+        "a file would be larger than allowed",
+        "raise the limit (ulimit -f); the same command carries on",
+    ),
     errno.ENOTDIR: ("E-RES-04", "not a folder", "give a folder"),
 }
 

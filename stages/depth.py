@@ -86,7 +86,12 @@ def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
     limits = Limits(config.max_relative_sigma, config.max_range_m)
     view = VirtualView(config.virtual_view)
     return [
-        _table(pair, ref_px, method, depths_by(method, view, config.virtual_baseline_m, rays, setting.poses[pair_id], limits))
+        _table(
+            pair,
+            ref_px,
+            method,
+            depths_by(method, view, config.virtual_baseline_m, rays, setting.poses[pair_id], limits),
+        )
         for method in config.methods
     ]
 

@@ -15,7 +15,18 @@ import typer
 
 from pipeline.engine.executors import usable_cores
 
-REQUIRED = ("numpy", "scipy", "opencv-python-headless", "pyarrow", "pyproj", "laspy", "lazrs", "pydantic", "torch", "kornia")
+REQUIRED = (
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pyarrow",
+    "pyproj",
+    "laspy",
+    "lazrs",
+    "pydantic",
+    "torch",
+    "kornia",
+)
 OPTIONAL = {"distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'"}
 GRIDS = {"egm96": "us_nga_egm96_15.tif", "egm2008": "us_nga_egm08_25.tif"}
 

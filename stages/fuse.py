@@ -51,8 +51,11 @@ def run(config: Config, context: Context) -> str:
     rows = sum(tile.rows for tile in written)
     if not rows:
         raise NothingLeftError(
-            "E-FUSE-01", "no point was seen often enough", found=f"{len(tiles)} tiles of observations",
-            expected=f"points seen by {config.min_observations} pairs", hint="--set fuse.min_observations=1",
+            "E-FUSE-01",
+            "no point was seen often enough",
+            found=f"{len(tiles)} tiles of observations",
+            expected=f"points seen by {config.min_observations} pairs",
+            hint="--set fuse.min_observations=1",
         )
     described = item(written, scene.transform.crs, "points", "Points by epipolar transfer, with covariance")
     (context.output("points") / "item.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")

@@ -30,11 +30,17 @@ class Config(StageConfig):
     matcher: Literal["sift"] = Field("sift", description="Feature and matcher")
     max_image_px: int = Field(1600, ge=64, description="Longest side an image is matched at (px)")
     max_features: int = Field(8192, ge=8, description="Most features per image (1)")
-    ratio: float = Field(0.85, gt=0.0, le=1.0, description="Largest ratio of best to second-best distance in the band (1)")
+    ratio: float = Field(
+        0.85, gt=0.0, le=1.0, description="Largest ratio of best to second-best distance in the band (1)"
+    )
     band_sigmas: float = Field(4.0, gt=0.0, description="Width of the epipolar band, in sigmas of pose and pixels (1)")
     nearest_m: float = Field(5.0, gt=0.0, description="Range of the nearest point looked for (m)")
-    sigma_px: float = Field(0.5, gt=0.0, description="One sigma of a matched position per axis, at the size matched at (px)")
-    consensus_px: float = Field(1.5, gt=0.0, description="Largest residual from the pair's own epipolar geometry, at the size matched at (px)")
+    sigma_px: float = Field(
+        0.5, gt=0.0, description="One sigma of a matched position per axis, at the size matched at (px)"
+    )
+    consensus_px: float = Field(
+        1.5, gt=0.0, description="Largest residual from the pair's own epipolar geometry, at the size matched at (px)"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +61,10 @@ def run(config: Config, context: Context) -> str:
     for _ in context.map(extract, wanted, shard=FEATURE_SHARD, label="images"):
         pass
     limits = SearchLimits(
-        Band(config.band_sigmas, config.sigma_px, config.nearest_m), config.ratio, config.consensus_px, config.max_image_px
+        Band(config.band_sigmas, config.sigma_px, config.nearest_m),
+        config.ratio,
+        config.consensus_px,
+        config.max_image_px,
     )
     job = partial(_match, images, extractor, limits, context.cache)
     context.map_tables("matches", job, pairs, shard=PAIR_SHARD, label="pairs")
@@ -68,7 +77,9 @@ def run(config: Config, context: Context) -> str:
     context.count_items(len(pairs), empty)
     if not inliers:
         raise NothingLeftError(
-            "E-MATCH-01", "no pair has a match that agrees with its pose", found=f"{len(pairs)} pairs, {found} matches",
+            "E-MATCH-01",
+            "no pair has a match that agrees with its pose",
+            found=f"{len(pairs)} pairs, {found} matches",
             expected="matches within the epipolar band of the logged poses",
             hint="wrong gimbal angles or camera? compare `epitransfer inspect`; widen: --set match.band_sigmas=10",
         )
@@ -132,6 +143,4 @@ def _count(folder: Path) -> dict[str, tuple[int, int]]:
     return {row["pair_id"]: (row["inlier_count"], row["inlier_sum"]) for row in grouped.to_pylist()}
 
 
-STAGE = Stage(
-    "match", 1, Config, ("frames", "cameras", "pairs"), ("matches",), run, facts_of=("ingest",)
-)
+STAGE = Stage("match", 1, Config, ("frames", "cameras", "pairs"), ("matches",), run, facts_of=("ingest",))

@@ -118,7 +118,8 @@ def _nothing(table: pa.Table, n_frames: int, config: Config) -> NothingLeftError
     return NothingLeftError(
         "E-PAIR-01",
         "no pair of frames can give depth",
-        found=f"{n_frames} usable frames; near the limits {table.num_rows} candidates rejected" + (f": {counted}" if counted else ""),
+        found=f"{n_frames} usable frames; near the limits {table.num_rows} candidates rejected"
+        + (f": {counted}" if counted else ""),
         expected=f"two frames {baseline} apart that see the same ground, epipole outside the region of interest",
         hint="a hover or a single photo has no baseline; otherwise see --set pair.baseline_m='[1, 40]', pair.roi, "
         "pair.epipole_margin_px, and `epitransfer inspect` for frames that are not usable",

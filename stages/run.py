@@ -37,7 +37,9 @@ def command(
     layers = [_sources(workflow, photos, camera, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
     configuration = resolve(layers, MODELS)
     if "ingest" not in configuration.sections:
-        raise UsageError("E-RUN-07", "the workflow has no [ingest] section", where=str(workflow), hint="add [ingest] photos")
+        raise UsageError(
+            "E-RUN-07", "the workflow has no [ingest] section", where=str(workflow), hint="add [ingest] photos"
+        )
     names = chosen_stages(configuration, first, last)
     folder = RunFolder(out)
     records = execute(folder, configuration, names, jobs=jobs or usable_cores(), scheduler=scheduler, forced=first)
@@ -52,12 +54,16 @@ def _sources(workflow: Path | None, photos: str | None, camera: str | None, lida
     if workflow is not None:
         if clash := [name for name, value in given.items() if value]:
             raise UsageError(
-                "E-RUN-08", f"--{clash[0]} stands in for a workflow file, and one is given", found=str(workflow),
+                "E-RUN-08",
+                f"--{clash[0]} stands in for a workflow file, and one is given",
+                found=str(workflow),
                 hint=f"use --set {'score.lidar' if clash[0] == 'lidar' else 'ingest.' + clash[0]}=...",
             )
         return workflow.name, load_workflow(workflow, MODELS)
     if photos is None:
-        raise UsageError("E-RUN-09", "nothing to run", expected="WORKFLOW.toml or --photos DIR", hint="epitransfer run --help")
+        raise UsageError(
+            "E-RUN-09", "nothing to run", expected="WORKFLOW.toml or --photos DIR", hint="epitransfer run --help"
+        )
     sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}
     sections["ingest"] = {key: value for key, value in (("photos", photos), ("camera", camera)) if value}
     if lidar:

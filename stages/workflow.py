@@ -22,7 +22,10 @@ def kept_sections(folder: RunFolder) -> Sections:
     """
     if not folder.workflow.exists():
         raise UsageError(
-            "E-RUN-04", "this folder holds no run", where=str(folder.root), expected="a folder with workflow.toml",
+            "E-RUN-04",
+            "this folder holds no run",
+            where=str(folder.root),
+            expected="a folder with workflow.toml",
             hint="epitransfer run WORKFLOW.toml --out RUN, or epitransfer ingest RUN --workflow WORKFLOW.toml",
         )
     return load_workflow(folder.workflow, MODELS)
@@ -43,7 +46,9 @@ def chosen_stages(configuration: Configuration, first: str | None, last: str | N
     for name in (first, last):
         if name is not None and name not in names:
             raise UsageError(
-                "E-RUN-05", f"the workflow has no stage {name}", expected=", ".join(names),
+                "E-RUN-05",
+                f"the workflow has no stage {name}",
+                expected=", ".join(names),
                 hint=f"add a section [{name}]" if name in STAGES else "one of the stages named",
             )
     begin = names.index(first) if first else 0
@@ -100,7 +105,9 @@ def _check_failures(records: Mapping[str, Any], configuration: Configuration) ->
         allowed = configuration.sections[name].max_failed_share
         if total and failed / total > allowed:
             raise TooManyFailuresError(
-                "E-RUN-06", f"{name}: too many items failed; the run is finished all the same",
-                found=f"{failed} of {total}", expected=f"at most {allowed:.0%}",
+                "E-RUN-06",
+                f"{name}: too many items failed; the run is finished all the same",
+                found=f"{failed} of {total}",
+                expected=f"at most {allowed:.0%}",
                 hint=f"the reasons are in the tables; --set {name}.max_failed_share=1 accepts them",
             )

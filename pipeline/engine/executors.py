@@ -18,6 +18,7 @@ from pipeline.engine.threads import limit_threads
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+
 def usable_cores() -> int:
     """Processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -84,7 +85,9 @@ class ProcessExecutor:
                 yield result
         except BrokenProcessPool as error:
             raise ResourceError(
-                "E-EXEC-01", "a worker process was killed", found=str(error),
+                "E-EXEC-01",
+                "a worker process was killed",
+                found=str(error),
                 hint="most likely out of memory: use --jobs 1, or a smaller match.max_image_px",
             ) from error
         finally:
@@ -128,9 +131,7 @@ class DaskExecutor:
         """As `Executor.map`."""
         source = iter(items)
         ahead = 2 * max(1, sum(self._client.nthreads().values()))
-        waiting: deque[Any] = deque(
-            self._client.submit(function, item, pure=False) for item in islice(source, ahead)
-        )
+        waiting: deque[Any] = deque(self._client.submit(function, item, pure=False) for item in islice(source, ahead))
         while waiting:
             result: Result = waiting.popleft().result()
             waiting.extend(self._client.submit(function, item, pure=False) for item in islice(source, 1))

@@ -78,7 +78,9 @@ class RunFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise UsageError(
-                    "E-RUN-01", "another process works on this run folder", where=str(self.root),
+                    "E-RUN-01",
+                    "another process works on this run folder",
+                    where=str(self.root),
                     hint="wait for it, or use another --out",
                 ) from error
             self.recover()

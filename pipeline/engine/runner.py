@@ -115,7 +115,9 @@ def run_stage(
     for name in stage.inputs:
         if not folder.output(name).exists():
             raise InputError(
-                "E-RUN-02", f"{stage.name} needs {name}, which is not there", where=str(folder.output(name)),
+                "E-RUN-02",
+                f"{stage.name} needs {name}, which is not there",
+                where=str(folder.output(name)),
                 hint=f"epitransfer run ... --to {stage.name}",
             )
     work = folder.work(stage.name, state.key)
@@ -258,7 +260,13 @@ class _StageContext:
                 yield result
 
     def map_tables(
-        self, name: str, function: Callable[[Sequence[Item]], pa.Table], items: Iterable[Item], *, shard: int, label: str
+        self,
+        name: str,
+        function: Callable[[Sequence[Item]], pa.Table],
+        items: Iterable[Item],
+        *,
+        shard: int,
+        label: str,
     ) -> None:
         numbered = list(enumerate(_shards(list(items), shard)))
         job = partial(_write_part, self.output(name), name, function)

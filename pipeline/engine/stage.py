@@ -63,7 +63,13 @@ class Context(Protocol):
         """
 
     def map_tables(
-        self, name: str, function: Callable[[Sequence[Item]], pa.Table], items: Iterable[Item], *, shard: int, label: str
+        self,
+        name: str,
+        function: Callable[[Sequence[Item]], pa.Table],
+        items: Iterable[Item],
+        *,
+        shard: int,
+        label: str,
     ) -> None:
         """As `map`, each shard's table written as one part of the output dataset `name`.
 

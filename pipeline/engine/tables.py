@@ -50,12 +50,18 @@ def read_table(path: Path, name: str) -> pa.Table:
         schema.check_schema(table.schema)
     except SchemaError as error:
         raise InputError(
-            "E-TABLE-02", f"the table {name} is of another schema", where=str(path), found=str(error),
+            "E-TABLE-02",
+            f"the table {name} is of another schema",
+            where=str(path),
+            found=str(error),
             hint="rerun the stage that writes it",
         ) from error
     except (pa.ArrowInvalid, pa.ArrowTypeError, OSError) as error:
         raise InputError(
-            "E-TABLE-03", f"the table {name} cannot be read", where=str(path), found=str(error),
+            "E-TABLE-03",
+            f"the table {name} cannot be read",
+            where=str(path),
+            found=str(error),
             hint="rerun the stage that writes it",
         ) from error
     return table

@@ -17,9 +17,7 @@ OutputCrs = CrsTransform
 
 # Vertical CRSs of no register, as WKT 2 (ISO 19162:2019, 10): zero is where the drone took off, or where the user says.
 _RELATIVE = {TAKEOFF: ("height above take-off", "take-off point"), LOCAL: ("local height", "local zero")}
-_VERTICAL_WKT = (
-    'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["gravity-related height (H)",up],LENGTHUNIT["metre",1]]'
-)
+_VERTICAL_WKT = 'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["gravity-related height (H)",up],LENGTHUNIT["metre",1]]'
 _KEY = "ingest.crs"
 # A zone of UTM: projects that cross a zone's edge keep to one.
 _AREA_MARGIN_DEG = 6.0

@@ -211,7 +211,9 @@ class _Best:
         columns = self.column[rows]
         mutual = self.src_row[columns] == rows
         rows, columns = rows[mutual], columns[mutual]
-        near, far = (np.sqrt(np.maximum(2.0 - 2.0 * s[rows].astype(np.float64), 0.0)) for s in (self.first, self.second))
+        near, far = (
+            np.sqrt(np.maximum(2.0 - 2.0 * s[rows].astype(np.float64), 0.0)) for s in (self.first, self.second)
+        )
         score = 1.0 - near / np.maximum(far, 1e-12)
         good = score >= 1.0 - ratio
         return FoundMatches(rows[good], columns[good], score[good])

@@ -70,7 +70,9 @@ class PixelGrid:
     spacing_px: float
 
     @classmethod
-    def of(cls, camera: Camera, per_side: int, box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)) -> PixelGrid:
+    def of(
+        cls, camera: Camera, per_side: int, box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    ) -> PixelGrid:
         """A grid over a part of the image.
 
         Args:

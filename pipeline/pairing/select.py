@@ -151,7 +151,14 @@ def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], i
     _reject(reason, baseline < low, "baseline", baseline, "m, below", low)
     _reject(reason, baseline > high, "baseline", baseline, "m, above", high)
     degrees = np.degrees(angle)
-    _reject(reason, angle > rules.max_view_angle_rad, "view angle", degrees, "deg, above", np.degrees(rules.max_view_angle_rad))
+    _reject(
+        reason,
+        angle > rules.max_view_angle_rad,
+        "view angle",
+        degrees,
+        "deg, above",
+        np.degrees(rules.max_view_angle_rad),
+    )
     epipole, margin = _epipole_rule(frames, pairs, grids, interest, reason == "")
     _reject(reason, margin < rules.epipole_margin_px, "epipole margin", margin, "px, below", rules.epipole_margin_px)
     overlap = _overlap_rule(frames, pairs, rules, grids, reason == "")
@@ -181,7 +188,12 @@ def _overlap_rule(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Gr
             if rows.size:
                 i, j = pairs[rows, 0], pairs[rows, 1]
                 overlap[rows] = ground_overlap(
-                    frames.view(i), frames.view(j), grids[a].overlap, camera, frames.above_ground_m[i], rules.max_range_m
+                    frames.view(i),
+                    frames.view(j),
+                    grids[a].overlap,
+                    camera,
+                    frames.above_ground_m[i],
+                    rules.max_range_m,
                 )
     return overlap
 

@@ -18,7 +18,8 @@ RELATIVE_POSES = TableSchema(
         Column(
             "cov",
             COVARIANCE_6X6,
-            "Row-major 6x6 covariance of the src camera's pose error seen from ref: rotation vector (rad), then centre (m), on the ref camera's axes.",
+            "Row-major 6x6 covariance of the src camera's pose error seen from ref, on the ref camera's axes: rotation "
+            "vector (rad), then centre (m).",
             "rad2, rad m, m2",
             "ref RDF",
         ),

@@ -135,7 +135,7 @@ def _summary(folder: Path, config: Config) -> str:
             "no depth may be published",
             found=f"{first.num_rows} matches: " + ", ".join(f"{r['counts']} {r['values']}" for r in reasons),
             expected=f"a predicted sigma within {config.max_relative_sigma:g} of the depth",
-            hint="a longer baseline (pair.baseline_m) or better poses; --set depth.max_relative_sigma=0.5 shows what there is",
+            hint="a longer baseline (pair.baseline_m) or better poses; --set depth.max_relative_sigma=0.5 shows more",
         )
     return f"{kept} of {first.num_rows} depths kept ({config.methods[0]}, {config.virtual_view} virtual view)"
 

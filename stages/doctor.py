@@ -13,7 +13,9 @@ from typing import Annotated
 import pyproj
 import typer
 
+from pipeline.engine.errors import UndeterminedError
 from pipeline.engine.executors import usable_cores
+from pipeline.geodesy.heights import Geoid
 
 REQUIRED = (
     "numpy",
@@ -28,7 +30,7 @@ REQUIRED = (
     "kornia",
 )
 OPTIONAL = {"distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'"}
-GRIDS = {"egm96": "us_nga_egm96_15.tif", "egm2008": "us_nga_egm08_25.tif"}
+DATUMS = ("egm96", "egm2008")
 
 
 def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False) -> None:
@@ -37,7 +39,7 @@ def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON objec
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in REQUIRED},
         "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
-        "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(file) for name, file in GRIDS.items()}},
+        "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(name) for name in DATUMS}},
         "cores": usable_cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "disk_free_gib": round(shutil.disk_usage(Path.cwd()).free / 2**30, 1),
@@ -61,7 +63,9 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _grid(file: str) -> str:
-    folders = pyproj.datadir.get_data_dir().split(os.pathsep) + [pyproj.datadir.get_user_data_dir()]
-    there = any((Path(folder) / file).exists() for folder in folders)
-    return "installed" if there else "missing: state ingest.geoid, or `projsync --file " + file + "`"
+def _grid(datum: str) -> str:
+    try:
+        Geoid.of(None, datum).undulation(0.0, 0.0)
+    except UndeterminedError:
+        return "missing: state ingest.geoid, or install the grid with projsync"
+    return "installed"

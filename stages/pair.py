@@ -79,8 +79,8 @@ def _flight(usable: pa.Table, context: Context, config: Config) -> Frames:
     if unknown.any():
         context.record("assumed_above_ground_m", ASSUMED_ABOVE_GROUND_M)
         context.warn(
-            f"{unknown.sum()} frames do not say their height above the ground; {ASSUMED_ABOVE_GROUND_M:g} m is assumed to "
-            "choose pairs (state it: --set pair.above_ground_m=...)"
+            f"{unknown.sum()} frames do not say their height above the ground; {ASSUMED_ABOVE_GROUND_M:g} m is assumed "
+            "to choose pairs (state it: --set pair.above_ground_m=...)"
         )
     return Frames(
         np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),

@@ -1,3 +1,4 @@
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -91,7 +92,5 @@ def test_malformed_override_is_a_usage_error(item: str) -> None:
     listed=st.lists(st.text(), max_size=3),
 )
 def test_toml_round_trip(text: str, number: float, flag: bool, listed: list[str]) -> None:
-    import tomllib
-
     section = {"text": text, "number": number, "flag": flag, "listed": listed}
     assert tomllib.loads(to_toml({"second": section}))["second"] == section

@@ -35,11 +35,9 @@ class EpiTransferError(Exception):
         return (_rebuild, (type(self), self.code, self.message, self.where, self.found, self.expected, self.hint))
 
     def __str__(self) -> str:
-        lines = [f"error[{self.code}]: {self.message}"]
-        for label in ("where", "found", "expected", "hint"):
-            if value := getattr(self, label):
-                lines.append(f"  {label:<9}{value}")
-        return "\n".join(lines)
+        labels = ("where", "found", "expected", "hint")
+        told = [f"  {label:<9}{value}" for label in labels if (value := getattr(self, label))]
+        return "\n".join([f"error[{self.code}]: {self.message}", *told])
 
 
 def _rebuild(

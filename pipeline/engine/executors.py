@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 from collections import deque
@@ -115,13 +116,13 @@ class DaskExecutor:
 
     def __init__(self, address: str) -> None:
         try:
-            from distributed import Client  # noqa: PLC0415 - an optional part
+            distributed: Any = importlib.import_module("distributed")
         except ImportError as error:
             raise MissingPartError(
                 "E-EXEC-02", "Dask is not installed", hint="pip install 'epitransfer[dask]'"
             ) from error
         try:
-            self._client: Any = Client(address, timeout=10)
+            self._client: Any = distributed.Client(address, timeout=10)
         except (OSError, TimeoutError) as error:
             raise ResourceError(
                 "E-EXEC-03", "no Dask scheduler answers", where=address, found=str(error), hint="check --scheduler"

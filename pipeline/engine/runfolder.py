@@ -1,7 +1,8 @@
 """The run folder: records of finished stages, the commit of a stage's outputs, and the manifest.
 
-A stage's outputs are made in `.work/`, renamed as a whole to `.pending/STAGE` (the commit), and rolled forward from there:
-old output aside, new one in place, the stage's record last. Opening a folder finishes what a killed run had committed.
+A stage's outputs are made in `.work/`, renamed as a whole to `.pending/STAGE` (the commit), and rolled forward from
+there: old output aside, new one in place, the stage's record last. Opening a folder finishes what a killed run had
+committed.
 """
 
 from __future__ import annotations

@@ -96,8 +96,8 @@ def with_vertical(horizontal: CRS, datum: str) -> CRS:
             where="ingest.height_datum",
             found=datum,
             expected=", ".join((ELLIPSOIDAL, *VERTICAL_EPSG, *_RELATIVE)),
-            hint="state it: --set ingest.height_datum=egm96 (or ellipsoidal, ...); local leaves the heights as logged, with no tie "
-            "to any other data",
+            hint="state it: --set ingest.height_datum=egm96 (or ellipsoidal, ...); local leaves the heights as "
+            "logged, with no tie to any other data",
         )
     relative = _RELATIVE.get(datum)
     vertical = CRS.from_wkt(_VERTICAL_WKT.format(*relative)) if relative else CRS.from_epsg(VERTICAL_EPSG[datum])

@@ -20,7 +20,8 @@ class Camera:
     """A camera's intrinsics.
 
     Args:
-        model: "pinhole", "brown" (k1 k2 p1 p2 k3 [k4 k5 k6], OpenCV's rational form) or "fisheye" (k1..k4, equidistant).
+        model: "pinhole", "brown" (k1 k2 p1 p2 k3 [k4 k5 k6], OpenCV's rational form) or "fisheye"
+            (k1..k4, equidistant).
         width: Image width, px.
         height: Image height, px.
         fx: Focal length along rows, px.

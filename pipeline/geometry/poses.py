@@ -1,7 +1,8 @@
 """Absolute and relative poses with their covariances.
 
 A frame's error has a part of its own and a part common to the flight (a GNSS bias, a misaligned gimbal or compass).
-The common part moves all points together but hardly changes the relative pose of two frames; it is kept apart throughout.
+The common part moves all points together but hardly changes the relative pose of two frames; it is kept apart
+throughout.
 """
 
 from __future__ import annotations

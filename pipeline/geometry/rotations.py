@@ -1,7 +1,8 @@
 """Rotations: quaternions (w, x, y, z), rotation vectors, and the attitude conventions of drones.
 
 A camera's axes are right-down-forward (RDF); a gimbal's are forward-right-down (FRD) with x along the optical axis,
-measured against local north-east-down (NED) in the order yaw, pitch, roll (intrinsic ZYX). World is east-north-up (ENU).
+measured against local north-east-down (NED) in the order yaw, pitch, roll (intrinsic ZYX). World is east-north-up
+(ENU).
 """
 
 from __future__ import annotations
@@ -76,7 +77,8 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
         rotation: (..., 3, 3).
 
     Returns:
-        (..., 4), w first. Shepperd's method: the largest of the four squares is divided by, so no case is ill-conditioned.
+        (..., 4), w first. Shepperd's method: the largest of the four squares is divided by, so no case is ill-
+        conditioned.
     """
     r = np.asarray(rotation, np.float64)
     trace = np.trace(r, axis1=-2, axis2=-1)
@@ -158,9 +160,9 @@ def gimbal_angles(rotation_enu_from_cam: Floats) -> Floats:
 def gimbal_error_axes(rotation_enu_from_cam: Floats) -> Floats:
     """The world axes about which small yaw, pitch and roll errors turn a camera on a gimbal.
 
-    A drone's gimbal turns about the vertical first, then about the level forward axis, then about the camera's own right
-    axis; those are the axes. Euler angles would not do: straight down, yaw and roll fall together, and no error would be
-    left about the level forward axis, which a gimbal has all the same.
+    A drone's gimbal turns about the vertical first, then about the level forward axis, then about the camera's own
+    right axis; those are the axes. Euler angles would not do: straight down, yaw and roll fall together, and no error
+    would be left about the level forward axis, which a gimbal has all the same.
 
     Args:
         rotation_enu_from_cam: (..., 3, 3).

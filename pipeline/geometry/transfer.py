@@ -1,18 +1,18 @@
 """Epipolar transfer to a virtual view, in closed form, with the depth's variance.
 
-Turn the src ray into the ref camera's axes and scale it to z = 1: r = (p, q, 1). With the ref ray d = (x, y, 1) and the src
-centre C in the ref frame, a depth s on the ref ray has to satisfy two equations,
+Turn the src ray into the ref camera's axes and scale it to z = 1: r = (p, q, 1). With the ref ray d = (x, y, 1) and
+the src centre C in the ref frame, a depth s on the ref ray has to satisfy two equations,
 
     s (x - p) = Cx - p Cz        s (y - q) = Cy - q Cz        in short  s g = h.
 
-A virtual view at V intersects the ref ray with the plane through V and the src ray. That plane's normal n has n . r = 0, so it
-is fixed by its first two components c, and
+A virtual view at V intersects the ref ray with the plane through V and the src ray. That plane's normal n has n . r =
+0, so it is fixed by its first two components c, and
 
     depth = (c . h) / (c . g),     n = (c1, c2, -p c1 - q c2)
 
-so choosing a virtual view is choosing how the two equations are weighted: V = b u gives c = (b uy - h2, h1 - b ux). The error
-of the two equations has the 2x2 covariance S (pose and pixels), and the variance of the depth is (c . S c) / (c . g)^2. It is
-least for c = S^-1 g: the adaptive virtual view.
+so choosing a virtual view is choosing how the two equations are weighted: V = b u gives c = (b uy - h2, h1 - b ux).
+The error of the two equations has the 2x2 covariance S (pose and pixels), and the variance of the depth is (c . S c)
+/ (c . g)^2. It is least for c = S^-1 g: the adaptive virtual view.
 
 Source: the paper, section III; METHOD.md, "Where it fails, and the adaptive virtual view".
 """
@@ -212,8 +212,8 @@ _QUARTIC = tuple((i, degree - i) for degree in range(5) for i in range(degree, -
 _FOLD = np.array(
     [[[(a[0] + b[0], a[1] + b[1]) == m for m in _QUARTIC] for b in _QUADRATIC] for a in _QUADRATIC], np.float64
 )
-# How the equations move when src turns by a and shifts by e: tau (a x r) + e on rows (1, 0, -p) and (0, 1, -q), r = (p, q, 1).
-# Rows: axis of a or e; columns: the quadratic monomials.
+# How the equations move when src turns by a and shifts by e: tau (a x r) + e on rows (1, 0, -p) and (0, 1, -q), r =
+# (p, q, 1). Rows: axis of a or e; columns: the quadratic monomials.
 _TURN = np.zeros((2, 3, 6))
 _TURN[0, 0, 4], _TURN[0, 1, [0, 3]], _TURN[0, 2, 2] = -1.0, 1.0, -1.0
 _TURN[1, 0, [0, 5]], _TURN[1, 1, 4], _TURN[1, 2, 1] = -1.0, 1.0, 1.0
@@ -235,8 +235,8 @@ def _pose_polynomials(covariance: Floats) -> Floats:
     rows = []
     for i, j in ((0, 0), (0, 1), (1, 1)):
         mixed = _TURN[i].T @ cross @ _SHIFT[j] + _SHIFT[i].T @ cross.T @ _TURN[j]
-        for form in (_TURN[i].T @ turn @ _TURN[j], mixed, _SHIFT[i].T @ shift @ _SHIFT[j]):
-            rows.append(np.einsum("ab,abm->m", form, _FOLD))
+        forms = (_TURN[i].T @ turn @ _TURN[j], mixed, _SHIFT[i].T @ shift @ _SHIFT[j])
+        rows += [np.einsum("ab,abm->m", form, _FOLD) for form in forms]
     return np.stack(rows)
 
 
@@ -336,8 +336,8 @@ class _Covariance:
     def at(self, depth: Floats) -> Spread:
         """S11, S12, S22 at the given depths.
 
-        A point at depth s lies tau = s - Cz along the src ray r. Shifting src by e and turning it by a moves the ray there by
-        e + tau a x r; src pixels enter the equations with -tau, ref pixels with s.
+        A point at depth s lies tau = s - Cz along the src ray r. Shifting src by e and turning it by a moves the ray
+        there by e + tau a x r; src pixels enter the equations with -tau, ref pixels with s.
         """
         length = float(np.sqrt(self.centre @ self.centre))
         # A depth that is negative or no number is one beyond infinity.

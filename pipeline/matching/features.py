@@ -63,7 +63,7 @@ class SiftExtractor:
         height, width = grey.shape
         size = shrunk_size(width, height, self.max_image_px)
         small = grey if size == (width, height) else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        detector = cv2.SIFT_create(nfeatures=self.max_features, contrastThreshold=self.contrast)
+        detector = cv2.SIFT.create(nfeatures=self.max_features, contrastThreshold=self.contrast)
         keypoints, descriptors = detector.detectAndCompute(np.asarray(small, np.uint8), None)
         if descriptors is None or not keypoints:
             return Features(np.empty((0, 2)), np.empty((0, 128), np.uint8))

@@ -1,10 +1,11 @@
 """Matching guided by the pose: a feature meets only features near its epipolar plane.
 
-All points on one epipolar plane are seen at the same angle about the baseline, from ref and from src alike. So both images'
-features are put on two angles: `about`, the turn about the baseline, and `along`, the angle from the direction towards src.
-A match needs equal `about` within the band that the pose covariance allows, and `along` larger in src than in ref (a point in
-front of both cameras), by no more than the parallax of the nearest point that is looked for. One sort makes the band a short
-list of neighbours; lens distortion is already in the rays, so the band is exact.
+All points on one epipolar plane are seen at the same angle about the baseline, from ref and from src alike. So both
+images' features are put on two angles: `about`, the turn about the baseline, and `along`, the angle from the
+direction towards src. A match needs equal `about` within the band that the pose covariance allows, and `along` larger
+in src than in ref (a point in front of both cameras), by no more than the parallax of the nearest point that is
+looked for. One sort makes the band a short list of neighbours; lens distortion is already in the rays, so the band is
+exact.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.arrays import Bools, Floats, Ints, Singles
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 
@@ -37,7 +38,7 @@ class Band:
     nearest_m: float
 
     def nearest_for(self, pose: RelativePose) -> float:
-        """The nearest range for a pair: a point nearer than the baseline turns by 60 deg or more, which no feature bears."""
+        """The nearest range for a pair: nearer than the baseline a point turns by 60 deg, which no feature bears."""
         return max(self.nearest_m, float(np.linalg.norm(pose.centre)))
 
 
@@ -65,14 +66,16 @@ def rays_in_ref(pixels: Floats, camera: Camera, rotation_ref_from_camera: Floats
         (n, 3).
     """
     rays = camera.rays(pixels) @ rotation_ref_from_camera.T
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    out: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return out
 
 
 def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, pixel_rad: float) -> EpipolarAngles:
     """Puts rays on their angles about the baseline, with the band's width for each.
 
-    The error of `about` at a ray is that of the epipolar plane's turn: m . (a + e / range) with m the plane's normal, a the
-    relative turn and e the shift of src, plus the pixels of both images; it grows as 1 / sin(along) towards the epipole.
+    The error of `about` at a ray is that of the epipolar plane's turn: m . (a + e / range) with m the plane's normal,
+    a the relative turn and e the shift of src, plus the pixels of both images; it grows as 1 / sin(along) towards the
+    epipole.
 
     Args:
         rays: (n, 3) unit rays on the ref axes.
@@ -103,7 +106,8 @@ def _turn_variance(direction: Floats, rays: Floats, pose: RelativePose, range_m:
     """Variance (rad^2) of the src ray's displacement along unit directions across it, at a range."""
     turn = np.cross(rays, direction)
     jacobian = np.concatenate([turn, direction / range_m], axis=1)
-    return np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian)
+    out: Floats = np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +126,8 @@ class FoundMatches:
 
 
 def match_guided(
-    ref_descriptors: Floats,
-    src_descriptors: Floats,
+    ref_descriptors: Singles,
+    src_descriptors: Singles,
     ref: EpipolarAngles,
     src: EpipolarAngles,
     *,
@@ -193,7 +197,7 @@ class _Best:
         self.src_first = np.full(n_src, -1.0, np.float32)
         self.src_row = np.full(n_src, -1, np.int64)
 
-    def update(self, rows: Ints, columns: Ints, similarity: Floats) -> None:
+    def update(self, rows: Ints, columns: Ints, similarity: Singles) -> None:
         pick = np.argmax(similarity, axis=1)
         line = np.arange(len(rows))
         self.first[rows] = similarity[line, pick]

@@ -90,4 +90,5 @@ def to_full_pixels(pixels: Floats, shrunk: tuple[int, int], full: tuple[int, int
     Returns:
         (n, 2).
     """
-    return (pixels + 0.5) * (np.array(full) / np.array(shrunk)) - 0.5
+    out: Floats = (pixels + 0.5) * (np.array(full) / np.array(shrunk)) - 0.5
+    return out

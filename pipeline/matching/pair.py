@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Bools, Floats
+from pipeline.geometry.arrays import Bools, Floats, Singles
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.features import Features
-from pipeline.matching.images import PixelSigma
 from pipeline.matching.guided import Band, epipolar_angles, match_guided, rays_in_ref
+from pipeline.matching.images import PixelSigma
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
 
 
@@ -106,7 +106,7 @@ def image_plane(rays: Floats) -> Floats:
     return rays[:, :2] / rays[:, 2:]
 
 
-def root_sift(features: Features) -> Floats:
+def root_sift(features: Features) -> Singles:
     """Unit descriptors: the square root of the L1-normalised ones (Arandjelovic and Zisserman, CVPR 2012).
 
     Returns:
@@ -114,7 +114,8 @@ def root_sift(features: Features) -> Floats:
     """
     values = features.descriptors.astype(np.float32)
     total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1e-12))
-    return np.sqrt(values / total)  # type: ignore[return-value]
+    out: Singles = np.sqrt(values / total)
+    return out
 
 
 def _max_parallax(pose: RelativePose, nearest_m: float) -> float:

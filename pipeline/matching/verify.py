@@ -1,4 +1,4 @@
-"""What is wrong with a match: a duplicate, off the logged pose by more than its error, or off the pair's own geometry."""
+"""What is wrong with a match: a duplicate, off the logged pose by more than its error, or off the consensus."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def epipolar_residuals(ref_rays: Floats, src_rays: Floats, pose: RelativePose, p
 
 
 def _ranges(ref_rays: Floats, src_unit: Floats, centre: Floats) -> Floats:
-    """Distance from src to the point nearest to both rays, held between the baseline's tenth and a thousand baselines."""
+    """Distance from src to the point nearest to both rays, within a tenth and a thousand baselines."""
     ref_unit = ref_rays / np.linalg.norm(ref_rays, axis=1, keepdims=True)
     cosine = np.sum(ref_unit * src_unit, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -105,6 +105,6 @@ def consensus(ref_xy: Floats, src_xy: Floats, threshold: float) -> Bools:
         threshold,
         _ITERATIONS,
     )
-    if mask is None:
-        return np.zeros(len(ref_xy), np.bool_)
-    return np.asarray(mask, np.bool_).reshape(-1)[: len(ref_xy)]
+    # OpenCV gives no mask at all where it finds no model, which its stubs do not know.
+    found = np.zeros(0, np.bool_) if mask is None else np.asarray(mask, np.bool_).reshape(-1)
+    return found if found.size == len(ref_xy) else np.zeros(len(ref_xy), np.bool_)

@@ -60,14 +60,16 @@ class PixelGrid:
     """Pixels spread over an image, with their rays.
 
     Args:
-        ideal_px: (k, 2) undistorted pixels.
-        rays: (k, 3) RDF, z = 1.
-        spacing_px: Distance between neighbours.
+        camera: Of the image.
+        box: Left, top, right, bottom of the part they cover, px.
+        rays: (k, 3) RDF, z = 1; NaN where the lens model gives none.
+        per_side: Pixels in a row; the rows follow one another.
     """
 
-    ideal_px: Floats
+    camera: Camera
+    box: tuple[float, float, float, float]
     rays: Floats
-    spacing_px: float
+    per_side: int
 
     @classmethod
     def of(
@@ -80,59 +82,42 @@ class PixelGrid:
             per_side: Pixels along each side of the part.
             box: Left, top, right, bottom as fractions of the image.
         """
-        left, top, right, bottom = box
-        u = np.linspace(left * camera.width, right * camera.width, per_side) - 0.5
-        v = np.linspace(top * camera.height, bottom * camera.height, per_side) - 0.5
+        # The edges of the image lie half a pixel outside the centres of its outermost pixels.
+        left, right = (fraction * camera.width - 0.5 for fraction in box[::2])
+        top, bottom = (fraction * camera.height - 0.5 for fraction in box[1::2])
+        u, v = np.linspace(left, right, per_side), np.linspace(top, bottom, per_side)
         pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        rays = camera.rays(pixels)
-        good = np.isfinite(rays).all(axis=1)
-        ideal = rays[good, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        return cls(ideal, rays[good], float(max(u[1] - u[0], v[1] - v[0])))
+        return cls(camera, (left, top, right, bottom), camera.rays(pixels), per_side)
+
+    @property
+    def ideal_px(self) -> Floats:
+        """(k, 2) undistorted pixels."""
+        return self.rays[:, :2] * (self.camera.fx, self.camera.fy) + (self.camera.cx, self.camera.cy)
+
+    def covers(self, rays: Floats) -> Bools:
+        """Whether rays (m, 3) with z = 1 fall into the part of the image."""
+        pixels = self.camera.project(rays)
+        left, top, right, bottom = self.box
+        inside: Bools = np.all((pixels >= (left, top)) & (pixels <= (right, bottom)), axis=-1)
+        return inside
 
 
-def sees_ground(frames: View, grid: PixelGrid, above_ground_m: Floats, max_range_m: float) -> Bools:
-    """Which pixels of each frame look at level ground within a range.
+def ground_level(frames: View, rays: Floats, above_ground_m: Floats, max_range_m: float) -> Floats:
+    """How steeply rays look down, against what it takes to meet level ground within a range.
 
     Args:
         frames: m frames.
-        grid: k pixels.
+        rays: (k, 3) for all frames, or (m, k, 3).
         above_ground_m: (m,) height of each camera above the ground.
         max_range_m: Farthest ground that counts.
 
     Returns:
-        (m, k).
+        (m, k); not negative where the ground is within the range, and smooth across the horizon.
     """
-    down = -np.einsum("mj,kj->mk", frames.rotation[:, 2, :], grid.rays)
-    length = np.linalg.norm(grid.rays, axis=1)
-    with np.errstate(divide="ignore"):
-        distance = np.where(down > 0.0, above_ground_m[:, None] * length / down, np.inf)
-    return distance <= max_range_m
-
-
-def epipole_margins(epipole_px: Floats, grid: PixelGrid, interest: Bools) -> Floats:
-    """Signed distance from each epipole to the region of interest.
-
-    The region is the union of the grid's cells around its pixels; half a cell is taken off the distance.
-
-    Args:
-        epipole_px: (m, 2) ideal pixels, NaN at infinity.
-        grid: k pixels.
-        interest: (m, k) which of them belong to the region of interest.
-
-    Returns:
-        (m,) px: positive outside; negative inside, by the distance to the nearest pixel that is not of interest;
-        infinite when the epipole is at infinity or nothing is of interest.
-    """
-    distance = np.linalg.norm(epipole_px[:, None, :] - grid.ideal_px[None], axis=2)
-    half = 0.5 * grid.spacing_px
-    to_interest = np.where(interest, distance, np.inf).min(axis=1)
-    to_rest = np.where(interest, np.inf, distance).min(axis=1)
-    low, high = grid.ideal_px.min(axis=0) - half, grid.ideal_px.max(axis=0) + half
-    to_border = np.minimum(epipole_px - low, high - epipole_px).min(axis=1)
-    inside = (to_interest <= to_rest) & (to_border > 0.0)
-    depth_inside = np.minimum(np.maximum(to_rest - half, 0.0), to_border)
-    margin = np.where(inside, -depth_inside, np.maximum(to_interest - half, 0.0))
-    return np.where(np.isnan(epipole_px).any(axis=1) | ~interest.any(axis=1), np.inf, margin)
+    down = -np.einsum(
+        "mj,mkj->mk", frames.rotation[:, 2, :], np.broadcast_to(rays, (len(above_ground_m), *rays.shape[-2:]))
+    )
+    return down / np.linalg.norm(rays, axis=-1) * max_range_m - above_ground_m[:, None]
 
 
 def ground_overlap(
@@ -153,8 +138,9 @@ def ground_overlap(
     Returns:
         (m,) in [0, 1].
     """
-    world = np.einsum("mij,kj->mki", ref.rotation, grid.rays)
-    length = np.linalg.norm(grid.rays, axis=1)
+    rays = grid.rays[np.isfinite(grid.rays).all(axis=1)]
+    world = np.einsum("mij,kj->mki", ref.rotation, rays)
+    length = np.linalg.norm(rays, axis=1)
     with np.errstate(divide="ignore"):
         scale = np.where(world[:, :, 2] < 0.0, above_ground_m[:, None] / -world[:, :, 2], np.inf)
     counted = scale * length <= max_range_m
@@ -177,11 +163,7 @@ def in_image(camera: Camera, points: Floats) -> Bools:
     Returns:
         (...).
     """
-    # The ideal image a little enlarged guards against the distortion polynomial folding far points back in.
-    reach = 0.75 * np.array([camera.width / camera.fx, camera.height / camera.fy])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        near = (points[..., 2] > 0.0) & (np.abs(points[..., :2]) <= reach * points[..., 2:]).all(axis=-1)
-    pixels = camera.project(np.where(near[..., None], points, np.nan))
+    pixels = camera.project(points)
     size = np.array([camera.width, camera.height]) - 0.5
     inside: Bools = np.all((pixels >= -0.5) & (pixels <= size), axis=-1)
     return inside

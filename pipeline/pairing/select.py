@@ -13,12 +13,12 @@ from pipeline.pairing.candidates import pairs_within
 from pipeline.pairing.geometry import (
     PixelGrid,
     View,
-    epipole_margins,
     epipoles,
+    ground_level,
     ground_overlap,
-    sees_ground,
     view_angles,
 )
+from pipeline.pairing.region import BorderGrid
 
 _BLOCK = 4096
 _REGION_GRID = 13
@@ -110,38 +110,25 @@ def select_pairs(frames: Frames, rules: PairRules) -> Iterator[Candidates]:
     distance = np.linalg.norm(frames.centre[pairs[:, 0]] - frames.centre[pairs[:, 1]], axis=1)
     pairs = pairs[distance * rules.near_limit >= rules.baseline_m[0]]
     grids = [_Grids.of(camera, rules) for camera in frames.cameras]
-    interest = _interest(frames, grids, rules)
     for start in range(0, len(pairs), _BLOCK):
-        yield _judge(frames, pairs[start : start + _BLOCK], rules, grids, interest)
+        yield _judge(frames, pairs[start : start + _BLOCK], rules, grids)
 
 
 @dataclass(frozen=True, slots=True)
 class _Grids:
     region: PixelGrid
+    border: BorderGrid
     overlap: PixelGrid
 
     @classmethod
     def of(cls, camera: Camera, rules: PairRules) -> _Grids:
-        inside = (0.02, 0.02, 0.98, 0.98)
         box = (0.0, 0.0, 1.0, 1.0) if isinstance(rules.region, str) else rules.region
-        return cls(PixelGrid.of(camera, _REGION_GRID, box), PixelGrid.of(camera, _OVERLAP_GRID, inside))
+        region = PixelGrid.of(camera, _REGION_GRID, box)
+        inside = (0.02, 0.02, 0.98, 0.98)
+        return cls(region, BorderGrid(region.ideal_px, _REGION_GRID), PixelGrid.of(camera, _OVERLAP_GRID, inside))
 
 
-def _interest(frames: Frames, grids: list[_Grids], rules: PairRules) -> Bools:
-    """(n, k): which pixels of each frame must be free of the epipole."""
-    interest = np.ones((len(frames.centre), _REGION_GRID**2), np.bool_)
-    if rules.region != "ground":
-        return interest
-    for index, grid in enumerate(grids):
-        of_camera = np.flatnonzero(frames.camera == index)
-        seen = sees_ground(frames.view(of_camera), grid.region, frames.above_ground_m[of_camera], rules.max_range_m)
-        # A frame that sees no ground within reach (a façade flight) has its whole image as region.
-        interest[of_camera, : seen.shape[1]] = seen | ~seen.any(axis=1, keepdims=True)
-        interest[of_camera, seen.shape[1] :] = False
-    return interest
-
-
-def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], interest: Bools) -> Candidates:
+def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids]) -> Candidates:
     i, j = pairs[:, 0], pairs[:, 1]
     ref, src = frames.view(i), frames.view(j)
     baseline = np.linalg.norm(ref.centre - src.centre, axis=1)
@@ -159,7 +146,7 @@ def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], i
         "deg, above",
         np.degrees(rules.max_view_angle_rad),
     )
-    epipole, margin = _epipole_rule(frames, pairs, grids, interest, reason == "")
+    epipole, margin = _epipole_rule(frames, pairs, rules, grids, reason == "")
     _reject(reason, margin < rules.epipole_margin_px, "epipole margin", margin, "px, below", rules.epipole_margin_px)
     overlap = _overlap_rule(frames, pairs, rules, grids, reason == "")
     _reject(reason, overlap < rules.min_overlap, "overlap", overlap, "below", rules.min_overlap)
@@ -167,16 +154,36 @@ def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], i
 
 
 def _epipole_rule(
-    frames: Frames, pairs: Ints, grids: list[_Grids], interest: Bools, alive: Bools
+    frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], alive: Bools
 ) -> tuple[Floats, Floats]:
     epipole, margin = np.full((len(pairs), 2), np.nan), np.full(len(pairs), np.nan)
     for index, camera in enumerate(frames.cameras):
         rows = np.flatnonzero(alive & (frames.camera[pairs[:, 0]] == index))
-        ref, src = frames.view(pairs[rows, 0]), frames.view(pairs[rows, 1])
-        epipole[rows] = epipoles(ref, src, camera)
-        grid = grids[index].region
-        margin[rows] = epipole_margins(epipole[rows], grid, interest[pairs[rows, 0], : len(grid.rays)])
+        if rows.size:
+            ref, src = frames.view(pairs[rows, 0]), frames.view(pairs[rows, 1])
+            epipole[rows] = epipoles(ref, src, camera)
+            margin[rows] = _margins(frames, pairs[rows, 0], epipole[rows], rules, grids[index])
     return epipole, margin
+
+
+def _margins(frames: Frames, ref: Ints, epipole_px: Floats, rules: PairRules, grids: _Grids) -> Floats:
+    """Signed distance from epipoles to the part of the ref image that must be free of them."""
+    camera = grids.region.camera
+    plane = (epipole_px - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    inside = grids.region.covers(rays)
+    distinct, frame = np.unique(ref, return_inverse=True)
+    level = np.ones((len(distinct), len(grids.region.rays)))
+    if rules.region == "ground":
+        level = ground_level(
+            frames.view(distinct), grids.region.rays, frames.above_ground_m[distinct], rules.max_range_m
+        )
+        # A frame that sees no ground within reach (a façade flight) has its whole image as region.
+        blind = ~(level >= 0.0).any(axis=1)
+        level[blind] = 1.0
+        at_epipole = ground_level(frames.view(ref), rays[:, None], frames.above_ground_m[ref], rules.max_range_m)[:, 0]
+        inside &= (at_epipole >= 0.0) | blind[frame]
+    return grids.border.margins(epipole_px, inside, level, frame)
 
 
 def _overlap_rule(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids], alive: Bools) -> Floats:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Floats, Ints
+from pipeline.geometry.arrays import AnyArray, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +72,10 @@ def _average(xyz: Floats, own: Floats, group: Ints) -> tuple[Floats, Floats]:
     return _sum(xyz * share[:, None], group), _sum(own * share[:, None, None], group)
 
 
-def _sum(values: Floats, group: Ints) -> Floats:
+def _sum(values: AnyArray, group: Ints) -> Floats:
     """Sums of the rows of each group."""
     flat = values.reshape(len(values), -1)
-    columns = [np.bincount(group, flat[:, i]) for i in range(flat.shape[1])]
+    columns = [np.bincount(group, flat[:, i]).astype(np.float64) for i in range(flat.shape[1])]
     return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.feather as feather
+from pyarrow import feather
 
 from pipeline.flight import PairRow, column, columns
 from pipeline.geodesy.transform import CrsTransform

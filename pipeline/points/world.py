@@ -1,8 +1,8 @@
 """World points from depths, with the covariance that pose, pixels and the flight's common error give them.
 
-A point lies at p = s v from the ref centre and q = p - B from the src centre (v the ref ray in ENU at z = 1, B the baseline).
-The depth moves with the src ray's displacement D at the point, ds = a . D, a the depth's normal. With world turns d and shifts
-e of the two cameras, D = e_src - e_ref + p x d_ref - q x d_src, and so, with M = v a^T,
+A point lies at p = s v from the ref centre and q = p - B from the src centre (v the ref ray in ENU at z = 1, B the
+baseline). The depth moves with the src ray's displacement D at the point, ds = a . D, a the depth's normal. With
+world turns d and shifts e of the two cameras, D = e_src - e_ref + p x d_ref - q x d_src, and so, with M = v a^T,
 
     dX = (I - M) e_ref + M e_src - (I - M) [p]x d_ref - M [q]x d_src + pixels
 """

@@ -9,7 +9,6 @@ matches stay the same, with the errors that they have, wrong ones too.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pipeline.engine.threads import limit_threads
 limit_threads()
 
 import numpy as np  # noqa: E402
-from flight_truth import BETWEEN, LEGS, FlightTruth, TruePose, reprojection_errors  # noqa: E402
+from flight_truth import BETWEEN, LEGS, FlightTruth, TruePose, configured, reprojection_errors  # noqa: E402
 
 from pipeline.depthing import Limits, MatchedRays, depths_by  # noqa: E402
 from pipeline.engine.tables import read_table  # noqa: E402
@@ -60,8 +59,7 @@ class Settings:
     @classmethod
     def of(cls, run: Path) -> Settings:
         """The settings of a run."""
-        stages = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["stages"]
-        match, depth = ({k: v["value"] for k, v in stages[name]["config"].items()} for name in ("match", "depth"))
+        match, depth = configured(run, "match"), configured(run, "depth")
         return cls(
             PixelSigma(match["sigma_px"], match["max_image_px"]),
             Limits(depth["max_relative_sigma"], depth["max_range_m"]),

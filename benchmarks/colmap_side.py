@@ -2,7 +2,7 @@
 
 usage: python benchmarks/colmap_side.py RUN PHOTOS WORK THREADS
 
-RUN is a run folder with `frames`, `cameras` and `pairs`; WORK an empty folder, where the model is left.
+RUN is a run folder, whose `frames`, `cameras` and `pairs` are taken; WORK an empty folder, where the model is left.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from flight_truth import configured
 
 from pipeline.engine.tables import read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geometry.cameras import Camera
 
 MODEL = "FULL_OPENCV"
-# As the match stage's defaults.
-MAX_IMAGE_PX, MAX_FEATURES = 2000, 8192
 
 
 def parameters(camera: Camera) -> list[float]:
@@ -34,14 +33,15 @@ def parameters(camera: Camera) -> list[float]:
     return [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, k1, k2, p1, p2, k3, k4, k5, k6]
 
 
-def extract(database: Path, photos: Path, names: list[str], camera: Camera, threads: int) -> None:
-    """SIFT on the processor, of the same size and number as ours."""
+def extract(run: Path, database: Path, photos: Path, names: list[str], camera: Camera, *, threads: int) -> None:
+    """SIFT on the processor, of the same image size and number of features as the run's."""
+    settings = configured(run, "match")
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = MODEL
     reader.camera_params = ",".join(repr(value) for value in parameters(camera))
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size, options.num_threads, options.use_gpu = MAX_IMAGE_PX, threads, False
-    options.sift.max_num_features = MAX_FEATURES
+    options.max_image_size, options.num_threads, options.use_gpu = settings["max_image_px"], threads, False
+    options.sift.max_num_features = settings["max_features"]
     pycolmap.extract_features(database, photos, names, pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu)
 
 
@@ -101,7 +101,7 @@ def main(run: Path, photos: Path, work: Path, threads: int) -> None:
     listed = work / "pairs.txt"
     listed.write_text("".join(f"{image_of[pair.ref]} {image_of[pair.src]}\n" for pair in pairs), encoding="utf-8")
     database = work / "database.db"
-    extract(database, photos, images, cameras.pop(), threads)
+    extract(run, database, photos, images, cameras.pop(), threads=threads)
     match(database, listed, threads)
     model = posed_model(database, run, dict(zip(images, ids, strict=True)))
     triangulate(model, database, photos, work / "model", threads)

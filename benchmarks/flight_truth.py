@@ -1,11 +1,13 @@
-"""The truth of a flight that `epitransfer example` made: poses, legs and exact depths at any pixel."""
+"""The truth of a flight that `epitransfer example` made: poses, legs and exact depths at any pixel; a run's facts."""
 
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from pipeline.geometry.rotations import rotation_from_quaternion
 from pipeline.simulation.flight import FORWARD, SIDEWAYS
 
 BETWEEN = "between"
+LEGS = (FORWARD, SIDEWAYS)
 # Where neighbouring pixels' depths differ by more, the pixel lies on an outline, and what it shows is not certain.
 EDGE_SHARE = 0.05
 
@@ -138,4 +141,13 @@ def reprojection_errors(
     return src_px - camera.project((world - src.centre) @ src.rotation)
 
 
-LEGS = (FORWARD, SIDEWAYS)
+def configured(run: Path, stage: str) -> dict[str, Any]:
+    """The configuration a stage of a run was made with."""
+    record = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["stages"][stage]
+    return {key: entry["value"] for key, entry in record["config"].items()}
+
+
+def facts(run: Path, stage: str) -> dict[str, Any]:
+    """What a stage of a run recorded for those after it."""
+    found: dict[str, Any] = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["stages"][stage]["facts"]
+    return found

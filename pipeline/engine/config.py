@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -176,7 +177,7 @@ def _toml_value(text: str) -> Any:
 
 def _absolute(value: Any, base: Path) -> Any:
     if isinstance(value, str) and "://" not in value and not _is_number(value):
-        return str((base / Path(value).expanduser()).absolute())
+        return os.path.normpath(base / Path(value).expanduser())
     if isinstance(value, list):
         return [_absolute(item, base) for item in value]
     return value

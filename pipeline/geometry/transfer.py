@@ -14,7 +14,7 @@ so choosing a virtual view is choosing how the two equations are weighted: V = b
 The error of the two equations has the 2x2 covariance S (pose and pixels), and the variance of the depth is (c . S c)
 / (c . g)^2. It is least for c = S^-1 g: the adaptive virtual view.
 
-Source: the paper, section III; METHOD.md, "Where it fails, and the adaptive virtual view".
+Source: Aggarwal et al., "EpiTransfer", section III, for the transfer; docs/method.md for the covariance.
 """
 
 from __future__ import annotations

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.arrays import Floats, Ints
 
+# Frames asked about at once: a hover, where every frame is near every other, stays within memory.
+_BLOCK = 256
 
-def pairs_within(centres: Floats, reach_m: float) -> Ints:
-    """All pairs of positions no farther apart than a reach.
+
+def pairs_within(centres: Floats, nearest_m: float, farthest_m: float) -> Iterator[Ints]:
+    """All pairs of positions within limits of distance.
 
     Args:
         centres: (n, 3) m.
-        reach_m: Largest distance, m.
+        nearest_m: Least distance, m.
+        farthest_m: Largest distance, m.
 
-    Returns:
-        (m, 2) indices (later, earlier), later > earlier, in lexical order.
+    Yields:
+        (m, 2) indices (later, earlier), later > earlier; in lexical order from block to block.
     """
-    if len(centres) < 2:
-        return np.empty((0, 2), np.int64)
-    found = cKDTree(centres).query_pairs(reach_m, output_type="ndarray").astype(np.int64)
-    found = np.sort(found, axis=1)[:, ::-1]
-    return found[np.lexsort((found[:, 1], found[:, 0]))]
+    everywhere = cKDTree(centres)
+    for start in range(0, len(centres), _BLOCK):
+        here = cKDTree(centres[start : start + _BLOCK])
+        found = here.sparse_distance_matrix(everywhere, farthest_m, output_type="ndarray")
+        later, earlier = found["i"].astype(np.int64) + start, found["j"].astype(np.int64)
+        wanted = (earlier < later) & (found["v"] >= nearest_m)
+        pairs = np.stack([later[wanted], earlier[wanted]], axis=1)
+        yield pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]

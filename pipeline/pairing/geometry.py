@@ -117,7 +117,8 @@ def ground_level(frames: View, rays: Floats, above_ground_m: Floats, max_range_m
     down = -np.einsum(
         "mj,mkj->mk", frames.rotation[:, 2, :], np.broadcast_to(rays, (len(above_ground_m), *rays.shape[-2:]))
     )
-    return down / np.linalg.norm(rays, axis=-1) * max_range_m - above_ground_m[:, None]
+    out: Floats = down / np.linalg.norm(rays, axis=-1) * max_range_m - above_ground_m[:, None]
+    return out
 
 
 def ground_overlap(

@@ -38,8 +38,8 @@ class BorderGrid:
             frame: (m,) row of `level` that an epipole belongs to.
 
         Returns:
-            (m,) px: positive outside the region, negative inside; infinite when the epipole is at infinity or there is no
-            region.
+            (m,) px: positive outside the region, negative inside; infinite when the epipole is at infinity or nothing
+            belongs to the region.
         """
         known = np.where(np.isfinite(self._px).all(axis=1), level, -1.0)
         start, end = (ends[frame] for ends in self._borders(known))

@@ -106,12 +106,11 @@ def select_pairs(frames: Frames, rules: PairRules) -> Iterator[Candidates]:
     Yields:
         Selected pairs and those rejected near the limits, in order of (later, earlier) frame.
     """
-    pairs = pairs_within(frames.centre, rules.baseline_m[1] * rules.near_limit)
-    distance = np.linalg.norm(frames.centre[pairs[:, 0]] - frames.centre[pairs[:, 1]], axis=1)
-    pairs = pairs[distance * rules.near_limit >= rules.baseline_m[0]]
     grids = [_Grids.of(camera, rules) for camera in frames.cameras]
-    for start in range(0, len(pairs), _BLOCK):
-        yield _judge(frames, pairs[start : start + _BLOCK], rules, grids)
+    low, high = rules.baseline_m
+    for pairs in pairs_within(frames.centre, low / rules.near_limit, high * rules.near_limit):
+        for start in range(0, len(pairs), _BLOCK):
+            yield _judge(frames, pairs[start : start + _BLOCK], rules, grids)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +178,7 @@ def _margins(frames: Frames, ref: Ints, epipole_px: Floats, rules: PairRules, gr
             frames.view(distinct), grids.region.rays, frames.above_ground_m[distinct], rules.max_range_m
         )
         # A frame that sees no ground within reach (a façade flight) has its whole image as region.
-        blind = ~(level >= 0.0).any(axis=1)
+        blind: Bools = ~np.any(level >= 0.0, axis=1)
         level[blind] = 1.0
         at_epipole = ground_level(frames.view(ref), rays[:, None], frames.above_ground_m[ref], rules.max_range_m)[:, 0]
         inside &= (at_epipole >= 0.0) | blind[frame]

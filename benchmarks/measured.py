@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-_INTERVAL_S = 0.05
+_INTERVAL_S = 0.1
 _PROC = Path("/proc")
 
 
@@ -19,9 +19,8 @@ class Cost:
 
     Args:
         wall_s: Wall time.
-        cpu_s: Processor time of it and all its children.
-        memory_mib: Most memory held at once, shared pages counted once; where the system does not tell (no /proc), the
-            largest process's.
+        cpu_s: Processor time of all its processes.
+        memory_mib: Most memory its processes held together, files they share left out.
     """
 
     wall_s: float
@@ -29,47 +28,57 @@ class Cost:
     memory_mib: float
 
 
-def measured(command: Sequence[str | Path], log: Path, cwd: Path | None = None) -> Cost:
-    """Runs a command to its end.
+class _Processes:
+    """A process and its descendants, looked at from outside: a pool's workers need not be reaped by the command itself."""
+
+    def __init__(self, root: int) -> None:
+        self._root = root
+        self._cpu_s: dict[int, float] = {}
+        self.peak_mib = 0.0
+
+    @property
+    def cpu_s(self) -> float:
+        return sum(self._cpu_s.values())
+
+    def look(self) -> None:
+        """Notes what each process has used so far, and what they hold together now."""
+        held, waiting = 0, [self._root]
+        while waiting:
+            pid = waiting.pop()
+            folder = _PROC / str(pid)
+            try:
+                # Fields after the name, which may hold spaces: utime and stime are the 14th and 15th of all.
+                times = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
+                resident, shared = (folder / "statm").read_text().split()[1:3]
+                for task in (folder / "task").iterdir():
+                    waiting += [int(child) for child in (task / "children").read_text().split()]
+            except OSError:
+                # It has ended meanwhile.
+                continue
+            self._cpu_s[pid] = sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
+            held += int(resident) - int(shared)
+        self.peak_mib = max(self.peak_mib, held * os.sysconf("SC_PAGE_SIZE") / 2**20)
+
+
+def measured(command: Sequence[str | Path], log: Path) -> Cost:
+    """Runs a command to its end, on a system with /proc.
 
     Args:
         command: Program and arguments.
         log: Where its output goes.
-        cwd: Folder it runs in.
 
     Raises:
         RuntimeError: It failed; its last words are in the message.
     """
     with log.open("w", encoding="utf-8") as stream:
         start = time.perf_counter()
-        process = subprocess.Popen([str(part) for part in command], stdout=stream, stderr=subprocess.STDOUT, cwd=cwd)
-        peak = 0.0
-        while True:
-            peak = max(peak, _held_mib(process.pid))
-            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-            if pid:
-                break
+        process = subprocess.Popen([str(part) for part in command], stdout=stream, stderr=subprocess.STDOUT)
+        processes = _Processes(process.pid)
+        while process.poll() is None:
+            processes.look()
             time.sleep(_INTERVAL_S)
         wall = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         last = log.read_text(encoding="utf-8", errors="replace")[-2000:]
         raise RuntimeError(f"{command[0]} ended with {process.returncode}:\n{last}")
-    return Cost(wall, usage.ru_utime + usage.ru_stime, peak or usage.ru_maxrss / 1024.0)
-
-
-def _held_mib(root: int) -> float:
-    """Proportional set size of a process and its descendants; 0 without /proc."""
-    total = 0.0
-    waiting = [root]
-    while waiting:
-        pid = waiting.pop()
-        try:
-            rollup = (_PROC / str(pid) / "smaps_rollup").read_text()
-            tasks = list((_PROC / str(pid) / "task").iterdir())
-            waiting += [int(child) for task in tasks for child in (task / "children").read_text().split()]
-        except OSError:
-            # It has ended meanwhile, or there is no /proc.
-            continue
-        total += sum(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) / 1024.0
-    return total
+    return Cost(wall, processes.cpu_s, processes.peak_mib)

@@ -58,7 +58,9 @@ def _plan(folder: RunFolder, axes: Axes) -> None:
     corner = np.floor(np.array([x.min(), y.min()]))
     order = np.argsort(z)
     low, high = np.percentile(z, [1, 99])
-    dots = axes.scatter((x - corner[0])[order], (y - corner[1])[order], c=z[order], s=0.3, cmap="viridis", vmin=low, vmax=high)
+    dots = axes.scatter(
+        (x - corner[0])[order], (y - corner[1])[order], c=z[order], s=0.3, cmap="viridis", vmin=low, vmax=high
+    )
     axes.set(
         aspect="equal",
         xlabel=f"easting - {corner[0]:.0f} (m)",

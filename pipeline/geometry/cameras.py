@@ -139,6 +139,19 @@ class Camera:
         out: Floats = jacobian * np.array([[self.fx], [self.fy]])
         return out
 
+    def holds(self, pixels: Floats) -> Bools:
+        """Whether pixels lie in the image; one that is no number does not.
+
+        Args:
+            pixels: (..., 2).
+
+        Returns:
+            (...).
+        """
+        size = np.array([self.width, self.height]) - 0.5
+        inside: Bools = np.all((pixels >= -0.5) & (pixels <= size), axis=-1)
+        return inside
+
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera for the image resampled to another size (half-pixel right)."""
         sx, sy = width / self.width, height / self.height

@@ -105,17 +105,8 @@ def in_image(view: View, points_in_enu_m: Floats, max_range_m: float) -> tuple[I
     index = index[offset[index] @ view.rotation_enu_from_cam[:, 2] > 0.0]
     in_cam = offset[index] @ view.rotation_enu_from_cam
     pixels = camera.project(in_cam)
-    inside = (
-        np.abs(pixels - ((camera.width - 1) / 2.0, (camera.height - 1) / 2.0))
-        <= (camera.width / 2.0, camera.height / 2.0)
-    ).all(axis=1)
-    # A distortion polynomial folds: far outside the field of view a point can get the pixel of another ray.
-    candidates = np.flatnonzero(inside)
-    if any(camera.distortion):
-        rays = camera.rays(pixels[candidates])
-        same = np.linalg.norm(rays - in_cam[candidates] / in_cam[candidates, 2:], axis=1) < 1e-6
-        candidates = candidates[same]
-    return index[candidates], pixels[candidates], in_cam[candidates, 2]
+    inside = np.flatnonzero(camera.holds(pixels))
+    return index[inside], pixels[inside], in_cam[inside, 2]
 
 
 def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range_m: float) -> Bools:

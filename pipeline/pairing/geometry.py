@@ -149,22 +149,6 @@ def ground_overlap(
     scale = np.where(none[:, None], 2.0 * above_ground_m[:, None], scale)
     counted |= none[:, None]
     points = world * np.where(counted, scale, 1.0)[:, :, None] + (ref.centre - src.centre)[:, None, :]
-    inside = in_image(src_camera, np.einsum("mji,mkj->mki", src.rotation, points))
+    inside = src_camera.holds(src_camera.project(np.einsum("mji,mkj->mki", src.rotation, points)))
     out: Floats = (inside & counted).sum(axis=1) / counted.sum(axis=1)
     return out
-
-
-def in_image(camera: Camera, points: Floats) -> Bools:
-    """Whether points in the camera frame fall into its image.
-
-    Args:
-        camera: The camera.
-        points: (..., 3) m, RDF.
-
-    Returns:
-        (...).
-    """
-    pixels = camera.project(points)
-    size = np.array([camera.width, camera.height]) - 0.5
-    inside: Bools = np.all((pixels >= -0.5) & (pixels <= size), axis=-1)
-    return inside

@@ -20,7 +20,7 @@ from pipeline.sources.dji import RTK_FIXED, RTK_SINGLE, Fix
 
 
 @dataclass(frozen=True, slots=True)
-class PoseSigmas:
+class LoggedSigmas:
     """One sigma of a pose error, whole and own; east, north, up in m; yaw, pitch, roll in degrees."""
 
     position_m: tuple[float, float, float]
@@ -72,7 +72,7 @@ def drone_class(model: str, rtk_flag: int | None) -> DroneClass:
     return known or (SURVEY if rtk_flag is not None and rtk_flag >= RTK_SINGLE else CONSUMER)
 
 
-def pose_sigmas(model: str, fix: Fix, height_datum: str) -> PoseSigmas:
+def pose_sigmas(model: str, fix: Fix, height_datum: str) -> LoggedSigmas:
     """The sigmas of a photo's pose.
 
     RTK sigmas as logged are taken as independent from frame to frame; without RTK the error is nearly common to
@@ -99,7 +99,7 @@ def pose_sigmas(model: str, fix: Fix, height_datum: str) -> PoseSigmas:
         east = north = up = fix.sigma_horizontal_m
     if height_datum == TAKEOFF:
         up, own = kind.barometer_m, (own[0], own[1], kind.own_position_m[2])
-    return PoseSigmas(
+    return LoggedSigmas(
         (east, north, up),
         kind.attitude_deg,
         (min(own[0], east), min(own[1], north), min(own[2], up)),

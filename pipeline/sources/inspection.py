@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from pipeline.engine.errors import EpiTransferError, InputError
 from pipeline.lidar.tile_crs import tile_crs
 from pipeline.sources import datums
-from pipeline.sources.accuracy import PoseSigmas, pose_sigmas
+from pipeline.sources.accuracy import LoggedSigmas, pose_sigmas
 from pipeline.sources.files import IMAGE_SUFFIXES, MARK_SUFFIXES, find, is_url, opened
 from pipeline.sources.mrk import read_marks
 from pipeline.sources.photos import PhotoRecord, read_photo
@@ -102,7 +102,7 @@ def _cameras(records: Sequence[PhotoRecord]) -> list[dict[str, Any]]:
     return [{**dict(zip(keys, camera, strict=True)), "photos": count} for camera, count in sorted(counts.items())]
 
 
-def _accuracy(sigmas: Sequence[PoseSigmas]) -> dict[str, float]:
+def _accuracy(sigmas: Sequence[LoggedSigmas]) -> dict[str, float]:
     """The worst sigma of each part, over all photos."""
     if not sigmas:
         return {}

@@ -29,7 +29,7 @@ class Cost:
 
 
 class _Processes:
-    """A process and its descendants, looked at from outside: a pool's workers need not be reaped by the command itself."""
+    """A process and its descendants, seen from outside: the system's own sums leave out workers of a fork server."""
 
     def __init__(self, root: int) -> None:
         self._root = root

@@ -143,9 +143,8 @@ def main(example: Path) -> None:
         script = Path(__file__).with_name("colmap_side.py")
         theirs = measured([sys.executable, script, run, photos, peer, str(THREADS)], work / "theirs.log")
         print(f"{len(truth.poses)} photos ({size / 2**20:.0f} MiB) to points on {THREADS} cores, one run of each side;")
-        print(
-            f"COLMAP {pycolmap.__version__}; as multiples of ours ({ours.wall_s:.0f} s, CPU {ours.cpu_s:.0f} s, {ours.memory_mib:.0f} MiB)\n"
-        )
+        spent = f"{ours.wall_s:.0f} s, CPU {ours.cpu_s:.0f} s, {ours.memory_mib:.0f} MiB"
+        print(f"COLMAP {pycolmap.__version__}; as multiples of ours ({spent})\n")
         for line in costs(ours, theirs):
             print(line)
         model = pycolmap.Reconstruction(peer / "model")

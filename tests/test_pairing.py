@@ -20,8 +20,8 @@ from pipeline.pairing.select import Candidates, Frames, PairRules, select_pairs
 DEG = np.pi / 180.0
 PLAIN = Camera("pinhole", 4000, 3000, 2800.0, 2810.0, 2010.0, 1490.0)
 LENS = Camera("brown", 4000, 3000, 2800.0, 2810.0, 2010.0, 1490.0, (-0.1, 0.02, 0.001, -0.0005, 0.0))
-STRONG = Camera("brown", 4000, 3000, 2800.0, 2800.0, 1999.5, 1499.5, (-0.3, 0.0, 0.0, 0.0, 0.0))
-WIDE = Camera("fisheye", 2000, 2000, 600.0, 600.0, 999.5, 999.5, (0.02, -0.003, 0.0, 0.0))
+STRONG = Camera("brown", 4000, 3000, 3600.0, 3600.0, 1999.5, 1499.5, (-0.3, 0.0, 0.0, 0.0, 0.0))
+WIDE = Camera("fisheye", 2000, 2000, 800.0, 800.0, 999.5, 999.5, (0.02, -0.003, 0.0, 0.0))
 RULES = PairRules((2.0, 20.0), 45.0 * DEG, 0.4, 50.0, "ground", 100.0)
 OPEN = PairRules((0.1, 50.0), np.pi, 0.0, -1e9, "ground", 100.0)
 
@@ -291,7 +291,7 @@ def test_distortion_does_not_fold_far_points_into_the_image() -> None:
     angles = np.radians(np.linspace(47.0, 89.0, 60))
     turns = np.linspace(0.0, 2.0 * np.pi, 60)
     points = np.stack([np.sin(angles) * np.cos(turns), np.sin(angles) * np.sin(turns), np.cos(angles)], axis=1)
-    folded = STRONG._distort(points[:, :2] / points[:, 2:])[0] * 2800.0 + (1999.5, 1499.5)
+    folded = STRONG._distort(points[:, :2] / points[:, 2:])[0] * 3600.0 + (1999.5, 1499.5)
     assert np.any(np.all((folded > 0.0) & (folded < (3999.0, 2999.0)), axis=1)), "the trap is real"
     assert not seen(STRONG, points).any()
     assert seen(STRONG, np.array([[0.3, 0.2, 1.0]])).all()

@@ -70,7 +70,7 @@ class BorderGrid:
         level_a, level_b = level[rows, a], level[rows, b]
         with np.errstate(divide="ignore", invalid="ignore"):
             share = level_a / (level_a - level_b)
-        return self._px[a] + share[..., None] * (self._px[b] - self._px[a])
+            return self._px[a] + share[..., None] * (self._px[b] - self._px[a])
 
     def _clipped(self, level: Floats, rows: Ints, end: Ints, other: Ints) -> Floats:
         """An end of the outline's segments, moved to where the region ends; NaN where no part is in the region."""

@@ -39,6 +39,7 @@ geoid = {UNDULATION_M:.1f}
 crs = "{COMPOUND_CRS}"
 
 [pair]
+baseline_m = [3.0, 16.0]
 
 [match]
 matcher = "sift"

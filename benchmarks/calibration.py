@@ -14,16 +14,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.engine.threads import limit_threads
+import numpy as np
+from flight_truth import BETWEEN, LEGS, FlightTruth, TruePose, configured, reprojection_errors
 
-limit_threads()
-
-import numpy as np  # noqa: E402
-from flight_truth import BETWEEN, LEGS, FlightTruth, TruePose, configured, reprojection_errors  # noqa: E402
-
-from pipeline.depthing import Limits, MatchedRays, depths_by  # noqa: E402
-from pipeline.engine.tables import read_table  # noqa: E402
-from pipeline.flight import (  # noqa: E402
+from pipeline.depthing import Limits, MatchedRays, depths_by
+from pipeline.engine.tables import read_table
+from pipeline.flight import (
     PairRow,
     camera_by_frame,
     cameras_of,
@@ -32,11 +28,11 @@ from pipeline.flight import (  # noqa: E402
     poses_of,
     selected_pairs,
 )
-from pipeline.geometry.arrays import Bools, Floats, Ints  # noqa: E402
-from pipeline.geometry.poses import Pose, relative_pose  # noqa: E402
-from pipeline.geometry.rotations import rotation_from_vector  # noqa: E402
-from pipeline.geometry.transfer import VirtualView  # noqa: E402
-from pipeline.matching.images import PixelSigma  # noqa: E402
+from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.poses import Pose, relative_pose
+from pipeline.geometry.rotations import rotation_from_vector
+from pipeline.geometry.transfer import VirtualView
+from pipeline.matching.images import PixelSigma
 
 METHODS = {"adaptive": "epitransfer", "DLT": "dlt"}
 REDRAWS, MATCHES_PER_PAIR, SEED = 200, 100, 11

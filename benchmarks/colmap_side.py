@@ -19,6 +19,7 @@ from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pair
 from pipeline.geometry.cameras import Camera
 
 MODEL = "FULL_OPENCV"
+SEED = 0
 
 
 def parameters(camera: Camera) -> list[float]:
@@ -51,7 +52,9 @@ def match(database: Path, pairs: Path, threads: int) -> None:
     options.num_threads, options.use_gpu = threads, False
     listed = pycolmap.ImportedPairingOptions()
     listed.match_list_path = pairs
-    pycolmap.match_image_pairs(database, options, listed, device=pycolmap.Device.cpu)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    pycolmap.match_image_pairs(database, options, listed, verification, pycolmap.Device.cpu)
 
 
 def posed_model(database: Path, run: Path, names: dict[str, str]) -> pycolmap.Reconstruction:
@@ -82,7 +85,8 @@ def triangulate(
 ) -> pycolmap.Reconstruction:
     """Points at the given poses; tracks of two views are kept, for most of ours have two."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
+    options.num_threads, options.random_seed = threads, SEED
+    options.triangulation.random_seed = SEED
     options.triangulation.ignore_two_view_tracks = False
     out.mkdir()
     return pycolmap.triangulate_points(model, database, photos, out, options=options)

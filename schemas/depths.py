@@ -27,7 +27,7 @@ DEPTHS = TableSchema(
         single(
             "transfer_angle_deg",
             "deg",
-            "Angle between the two epipolar lines that meet in the virtual view.",
+            "Tilt about the src ray between the plane used and the epipolar plane: 90 is best, 0 the trifocal plane.",
             nullable=True,
         ),
         single(

@@ -48,7 +48,7 @@ FRAMES = TableSchema(
         time_ns("time", "Exposure.", nullable=True),
         text(
             "time_source",
-            "Where time and zone came from: utc_at_exposure, mrk, gps, exif+offset, exif+gps zone, exif (zone unknown).",
+            "Where time and zone came from: utc_at_exposure, mrk, gps, exif+offset, exif+gps zone, exif (zone unknown)",
         ),
         number("latitude_deg", "deg", "Camera centre, WGS 84.", frame="EPSG:4979", nullable=True),
         number("longitude_deg", "deg", "Camera centre, WGS 84.", frame="EPSG:4979", nullable=True),

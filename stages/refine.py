@@ -17,7 +17,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, relative_pose
 from pipeline.matching.images import PixelSigma
 from pipeline.matching.verify import epipolar_residuals
-from schemas import POSES, RELATIVE_POSES
+from schemas import MATCHES, POSES, RELATIVE_POSES
 
 
 class Config(StageConfig):
@@ -33,10 +33,15 @@ def run(config: Config, context: Context) -> str:
     poses = poses_of(frames)
     sigma = PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px"))
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
-    rows = []
+    found: dict[str, dict[str, object]] = {}
     for file in parquet_files(context.path("matches")):
         for pair_id, matches in by_pair(read_table(file, "matches")).items():
-            rows.append(_row(pairs[pair_id], matches, poses, cameras, sigma, config.mode))
+            found[pair_id] = _row(pairs[pair_id], matches, poses, cameras, sigma, config.mode)
+    # A pair without a single match has its row too.
+    none = MATCHES.empty()
+    rows = [
+        found.get(pair_id) or _row(pair, none, poses, cameras, sigma, config.mode) for pair_id, pair in pairs.items()
+    ]
     context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
     usable = frames.filter(frames.column("usable"))
     context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
@@ -49,6 +54,8 @@ def run(config: Config, context: Context) -> str:
 def by_pair(matches: pa.Table) -> dict[str, pa.Table]:
     """The rows of each pair, in the table's order."""
     out: dict[str, pa.Table] = {}
+    if not matches.num_rows:
+        return out
     ids = matches.column("pair_id").combine_chunks().dictionary_encode()
     codes = ids.indices.to_numpy()
     ends = np.flatnonzero(np.diff(codes, append=-1)) + 1

@@ -96,7 +96,7 @@ def brute_margin(
     camera: Camera, rotation: Floats, up: float, epipole: Floats, box: tuple[float, ...], roi: str
 ) -> float:
     """Signed distance to a region painted on a dense raster, in ideal pixels."""
-    n = 361
+    n = 261
     u = np.linspace(box[0] * camera.width, box[2] * camera.width, n) - 0.5
     v = np.linspace(box[1] * camera.height, box[3] * camera.height, n) - 0.5
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -119,7 +119,7 @@ def test_margins_are_those_of_a_painted_region(camera: Camera, roi: str | tuple[
     rules = PairRules((0.1, 1e3), np.pi, 0.0, -1e9, roi, 100.0)  # type: ignore[arg-type]
     box = (0.0, 0.0, 1.0, 1.0) if isinstance(roi, str) else roi
     signs = set()
-    for _ in range(25):
+    for _ in range(20):
         yaw, pitch, roll, up = rng.uniform(-180, 180), rng.uniform(-60, 5), rng.normal(0, 5), rng.uniform(10, 95)
         rotation = enu_from_cam(yaw * DEG, pitch * DEG, roll * DEG)
         epipole = rng.uniform([-1200, -1200], [5200, 4200])
@@ -264,7 +264,7 @@ def test_candidates_far_from_the_limits_are_not_kept() -> None:
 @pytest.mark.parametrize("src_camera", [PLAIN, WIDE], ids=["to pinhole", "to fisheye"])
 def test_overlap_is_the_share_of_ground_points_that_both_see(camera: Camera, src_camera: Camera) -> None:
     rng = np.random.default_rng(11)
-    shares = []
+    shares, errors = [], []
     for _ in range(12):
         step = rng.normal(0.0, 8.0, 3) * (1.0, 1.0, 0.2)
         frames = flight(
@@ -280,10 +280,12 @@ def test_overlap_is_the_share_of_ground_points_that_both_see(camera: Camera, src
         at = src_camera.project((points - frames.centre[0]) @ frames.rotation[0])
         both = np.all((at >= -0.5) & (at <= np.array([src_camera.width, src_camera.height]) - 0.5), axis=1).mean()
         shares.append(both)
-        # 36 points stand for the image; a cell is 1/6 of its side.
-        assert found.overlap[0] == pytest.approx(both, abs=0.13)
-    assert min(shares) < 0.9
-    assert max(shares) > 0.3
+        # 36 points stand for the image.
+        assert found.overlap[0] == pytest.approx(both, abs=0.11)
+        errors.append(found.overlap[0] - both)
+    assert abs(np.mean(errors)) < 0.03, "no bias towards the image's edges"
+    if src_camera is PLAIN:
+        assert max(shares) - min(shares) > 0.3
 
 
 def test_distortion_does_not_fold_far_points_into_the_image() -> None:

@@ -49,7 +49,7 @@ def epipoles(ref: View, src: View, camera: Camera) -> Floats:
         (m, 2) px; NaN where the line is parallel to the image plane.
     """
     centre = np.einsum("mji,mj->mi", ref.rotation, src.centre - ref.centre)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         pixels = centre[:, :2] / centre[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     far = ~(np.abs(pixels) < _FAR_PX).all(axis=1)
     return np.where(far[:, None], np.nan, pixels)

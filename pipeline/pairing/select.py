@@ -123,8 +123,10 @@ class _Grids:
     def of(cls, camera: Camera, rules: PairRules) -> _Grids:
         box = (0.0, 0.0, 1.0, 1.0) if isinstance(rules.region, str) else rules.region
         region = PixelGrid.of(camera, _REGION_GRID, box)
-        inside = (0.02, 0.02, 0.98, 0.98)
-        return cls(region, BorderGrid(region.ideal_px, _REGION_GRID), PixelGrid.of(camera, _OVERLAP_GRID, inside))
+        # The middles of equal cells, so that each stands for as much of the image.
+        edge = 0.5 / _OVERLAP_GRID
+        middles = (edge, edge, 1.0 - edge, 1.0 - edge)
+        return cls(region, BorderGrid(region.ideal_px, _REGION_GRID), PixelGrid.of(camera, _OVERLAP_GRID, middles))
 
 
 def _judge(frames: Frames, pairs: Ints, rules: PairRules, grids: list[_Grids]) -> Candidates:

@@ -20,7 +20,7 @@ from pipeline.matching.images import PixelSigma, read_colour
 from pipeline.points.geoparquet import tile_table
 from pipeline.points.merge import merge_voxels
 from pipeline.points.tiles import tile_corners, tile_name, tile_order
-from pipeline.points.world import world_points
+from pipeline.points.world import Shot, world_points
 
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -79,10 +79,13 @@ def observations(scene: Scene, depths: pa.Table) -> pa.Table:
 def _of_pair(scene: Scene, pair: PairRow, rows: pa.Table, picture: Bytes) -> pa.Table:
     pixels, depth = columns(rows, ("u", "v")), np.asarray(column(rows, "depth_m"), np.float64)
     normal = columns(rows, ("normal_x", "normal_y", "normal_z"))
-    camera, ref, src = scene.cameras[pair.ref], scene.poses[pair.ref], scene.poses[pair.src]
-    points = world_points(pixels, depth, normal, camera, ref, src, scene.sigma.of(camera))
+    ref, src = (
+        Shot(scene.cameras[frame], scene.poses[frame], scene.sigma.of(scene.cameras[frame]))
+        for frame in (pair.ref, pair.src)
+    )
+    points = world_points(pixels, depth, normal, ref, src)
     # Convergence and scale hardly change over one frame's view: the Jacobian at its camera serves all its points.
-    jacobian = scene.transform.jacobian(ref.centre)
+    jacobian = scene.transform.jacobian(ref.pose.centre)
     own, common = (jacobian @ part @ jacobian.T for part in (points.own, points.common))
     height, width = picture.shape[:2]
     at = np.clip(np.round(pixels).astype(np.int64), 0, (width - 1, height - 1))

@@ -34,21 +34,33 @@ class WorldPoints:
     common: Floats
 
 
-def world_points(
-    ref_px: Floats, depth_m: Floats, normal: Floats, camera: Camera, ref: Pose, src: Pose, sigma_px: float
-) -> WorldPoints:
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One image of a pair, as far as its points are concerned.
+
+    Args:
+        camera: Its camera.
+        pose: Its pose.
+        sigma_px: One sigma of a matched position, per axis.
+    """
+
+    camera: Camera
+    pose: Pose
+    sigma_px: float
+
+
+def world_points(ref_px: Floats, depth_m: Floats, normal: Floats, ref_shot: Shot, src_shot: Shot) -> WorldPoints:
     """Points of one pair.
 
     Args:
         ref_px: (n, 2) pixels of ref as given.
         depth_m: (n,).
         normal: (n, 3) of the depth, on the ref camera's axes.
-        camera: Of ref.
-        ref: Its pose.
-        src: The pose of the other frame.
-        sigma_px: One sigma of a matched position, per axis.
+        ref_shot: The image that has the depth.
+        src_shot: The other.
     """
-    rays = camera.rays(ref_px)
+    ref, src = ref_shot.pose, src_shot.pose
+    rays = ref_shot.camera.rays(ref_px)
     v = rays @ ref.rotation.T
     p = depth_m[:, None] * v
     baseline = src.centre - ref.centre
@@ -61,8 +73,8 @@ def world_points(
         + _spread(by_src * src.own.position_m)
         + _spread(turn_ref * ref.own.gimbal_rad)
         + _spread(turn_src * src.own.gimbal_rad)
-        + _spread(_by_pixels(by_ref, rays, depth_m, camera, ref) * sigma_px)
-        + _spread(_by_src_pixels(by_src, q, camera) * sigma_px)
+        + _spread(_by_pixels(by_ref, depth_m[:, None] * rays, ref_shot))
+        + _spread(_by_pixels(by_src, q @ src.rotation, src_shot))
     )
     # What all frames share: the same shift, and the same error of yaw, pitch and roll in both.
     common = np.diag(ref.common.position_m**2) + _spread((turn_ref + turn_src) * ref.common.gimbal_rad)
@@ -74,17 +86,15 @@ def _spread(jacobian: Floats) -> Floats:
     return out
 
 
-def _by_pixels(by_ref: Floats, rays: Floats, depth_m: Floats, camera: Camera, ref: Pose) -> Floats:
-    """(n, 3, 2): how the point moves with the ref pixel."""
-    on_plane = np.linalg.inv(camera.pixel_jacobian(rays))
-    out: Floats = by_ref @ (ref.rotation[:, :2] @ on_plane) * depth_m[:, None, None]
-    return out
+def _by_pixels(by_ray: Floats, points: Floats, shot: Shot) -> Floats:
+    """(n, 3, 2): how far one sigma of each pixel axis moves the point, by how the point moves with the ray at it.
 
-
-def _by_src_pixels(by_src: Floats, q: Floats, camera: Camera) -> Floats:
-    """(n, 3, 3): how the point moves with the src pixel, taken the same in all directions across the src ray."""
-    range_m = np.linalg.norm(q, axis=1)
-    unit = q / range_m[:, None]
-    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-    out: Floats = by_src @ across * (range_m / camera.focal_px)[:, None, None]
+    Args:
+        by_ray: (n, 3, 3) in ENU.
+        points: (n, 3) m in the camera's frame.
+        shot: The image.
+    """
+    depth = points[:, 2, None]
+    on_plane = np.linalg.inv(shot.camera.pixel_jacobian(points / depth))
+    out: Floats = by_ray @ (shot.pose.rotation[:, :2] @ on_plane) * (depth * shot.sigma_px)[:, :, None]
     return out

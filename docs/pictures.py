@@ -47,7 +47,7 @@ def _overlays(folder: RunFolder, depth_axes: Axes, sigma_axes: Axes) -> None:
     ):
         axes.imshow(picture.mean(axis=2), cmap="gray", vmin=0, vmax=330)
         dots = axes.scatter(u, v, c=values, s=2.5, cmap="turbo", vmin=limits[0], vmax=limits[1], linewidths=0)
-        axes.set(xticks=[], yticks=[], title=f"{FRAME}: {label}, {len(u):,} points")
+        axes.set(xticks=[], yticks=[], title=label)
         axes.figure.colorbar(dots, ax=axes, shrink=0.82, label=label)
 
 
@@ -65,7 +65,7 @@ def _plan(folder: RunFolder, axes: Axes) -> None:
         aspect="equal",
         xlabel=f"easting - {corner[0]:.0f} (m)",
         ylabel=f"northing - {corner[1]:.0f} (m)",
-        title=f"{len(x):,} fused points, height",
+        title=f"{len(x):,} fused points",
     )
     axes.figure.colorbar(dots, ax=axes, shrink=0.82, label="height above NAVD 88 (m)")
 

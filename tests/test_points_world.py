@@ -1,0 +1,262 @@
+"""World points against redrawn poses and pixels, and merging without counting an error twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.depthing import MatchedRays
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.poses import Pose, PoseSigmas, relative_pose
+from pipeline.geometry.rotations import enu_from_cam
+from pipeline.geometry.transfer import VirtualView, transfer_with_sigma
+from pipeline.matching.images import PixelSigma
+from pipeline.points.merge import Merged, merge_voxels
+from pipeline.points.world import Shot, WorldPoints, world_points
+
+DEG = np.pi / 180.0
+PLAIN = Camera("pinhole", 4000, 3000, 2800.0, 2810.0, 2010.0, 1490.0)
+LENS = Camera("brown", 4000, 3000, 2900.0, 2905.0, 2010.0, 1490.0, (-0.1, 0.02, 0.001, -0.0005, 0.0))
+WIDE = Camera("fisheye", 1600, 1200, 700.0, 705.0, 802.0, 597.0, (0.02, -0.003, 0.0, 0.0))
+SIGMA = PixelSigma(0.5, 2000)
+NONE = PoseSigmas(np.zeros(3), np.zeros(3))
+OWN = PoseSigmas(np.array([0.02, 0.03, 0.04]), np.array([0.05, 0.03, 0.04]) * DEG)
+COMMON = PoseSigmas(np.array([1.0, 1.5, 2.5]), np.array([0.5, 0.3, 0.2]) * DEG)
+FORWARD = ((3.0, -20.0, 0.5), (0.0, 8.0, 31.0)), ((1.0, -21.0, 0.0), (0.5, 0.0, 30.5))
+SIDEWAYS = ((40.0, -35.0, -1.0), (6.0, -5.0, 31.0)), ((42.0, -34.0, 1.0), (0.0, 0.0, 31.0))
+# Ref pixels as shares of the image, off the epipole of the forward pair, and ranges.
+AT = np.array([[0.1, 0.9], [0.5, 0.8], [0.9, 0.7], [0.3, 0.6], [0.05, 0.5]])
+RANGE_M = np.array([18.0, 25.0, 30.0, 40.0, 35.0])
+
+
+class Pair:
+    """Two cameras over known points."""
+
+    def __init__(
+        self,
+        ends: tuple[tuple[tuple[float, ...], ...], ...],
+        cameras: tuple[Camera, Camera],
+        sigmas: dict[str, PoseSigmas],
+    ) -> None:
+        self.ends, self.cameras, self.sigmas = ends, cameras, sigmas
+        ref, src = self.poses(np.zeros(18))
+        camera = cameras[0]
+        self.ref_px = AT * (camera.width, camera.height)
+        rays = camera.rays(self.ref_px)
+        self.points = (
+            ref.centre + (rays / np.linalg.norm(rays, axis=1, keepdims=True) * RANGE_M[:, None]) @ ref.rotation.T
+        )
+        self.src_px = cameras[1].project((self.points - src.centre) @ src.rotation)
+        assert cameras[1].holds(self.src_px).all()
+
+    def poses(self, error: Floats) -> tuple[Pose, Pose]:
+        """Both poses with errors: (gimbal, position) own of ref, own of src, and common."""
+        common = error[12:]
+        return tuple(  # type: ignore[return-value]
+            Pose(
+                enu_from_cam(*(np.array(angles) * DEG + own[:3] + common[:3])),
+                np.array(centre) + own[3:] + common[3:],
+                self.sigmas.get("own", NONE),
+                self.sigmas.get("common", NONE),
+            )
+            for (angles, centre), own in zip(self.ends, (error[:6], error[6:12]), strict=True)
+        )
+
+    def placed(self, error: Floats, ref_px: Floats, src_px: Floats, sigma: PixelSigma = SIGMA) -> WorldPoints:
+        """The points as the pipeline finds them from disturbed poses and pixels."""
+        ref, src = self.poses(error)
+        rays = MatchedRays.of(ref_px, src_px, *self.cameras, sigma)
+        depths = transfer_with_sigma(rays.ref, rays.src, relative_pose(ref, src), VirtualView.ADAPTIVE, rays.noise)
+        shots = (Shot(c, p, sigma.of(c)) for c, p in zip(self.cameras, (ref, src), strict=True))
+        return world_points(ref_px, depths.depth_m, depths.normal, *shots)
+
+    def redrawn(self, rng: np.random.Generator, draws: int, *, own: bool, common: bool, pixels: bool) -> Floats:
+        """(draws, n, 3): where the points come to lie."""
+        out = []
+        for _ in range(draws):
+            error = np.zeros(18)
+            for part, sigmas, wanted in (
+                (slice(0, 6), OWN, own), (slice(6, 12), OWN, own), (slice(12, 18), COMMON, common)
+            ):  # fmt: skip
+                if wanted:
+                    error[part] = rng.normal(0.0, np.concatenate([sigmas.gimbal_rad, sigmas.position_m]))
+            noise = [rng.normal(0.0, SIGMA.of(c), self.ref_px.shape) * pixels for c in self.cameras]
+            out.append(self.placed(error, self.ref_px + noise[0], self.src_px + noise[1]).p_in_enu_m)
+        return np.array(out)
+
+
+def assert_spread(points: Floats, covariance: Floats, within: float) -> None:
+    """The redrawn points' covariance in the coordinates in which the predicted one is the unit matrix."""
+    for j in range(points.shape[1]):
+        found = np.cov(points[:, j].T)
+        root = np.linalg.inv(np.linalg.cholesky(covariance[j]))
+        eigenvalues = np.linalg.eigvalsh(root @ found @ root.T)
+        np.testing.assert_allclose(np.sqrt(eigenvalues), 1.0, atol=within)
+
+
+CAMERAS = {"pinhole": (PLAIN, PLAIN), "brown": (LENS, LENS), "unequal": (LENS, WIDE), "unequal back": (WIDE, PLAIN)}
+
+
+@pytest.mark.parametrize("cameras", CAMERAS)
+@pytest.mark.parametrize("ends", [FORWARD, SIDEWAYS], ids=["forward", "sideways"])
+def test_own_covariance_of_pixels_alone(ends: object, cameras: str) -> None:
+    """Through lens distortion, off the axis, and with src of another size: what a focal length alone would get wrong."""
+    pair = Pair(ends, CAMERAS[cameras], {})  # type: ignore[arg-type]
+    points = pair.redrawn(np.random.default_rng(1), 1500, own=False, common=False, pixels=True)
+    predicted = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
+    assert_spread(points, predicted.own, 0.1)
+    assert not predicted.common.any()
+
+
+@pytest.mark.parametrize("ends", [FORWARD, SIDEWAYS], ids=["forward", "sideways"])
+def test_own_covariance_of_poses_and_pixels(ends: object) -> None:
+    pair = Pair(ends, (LENS, LENS), {"own": OWN})  # type: ignore[arg-type]
+    points = pair.redrawn(np.random.default_rng(2), 2500, own=True, common=False, pixels=True)
+    predicted = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
+    assert_spread(points, predicted.own, 0.1)
+
+
+@pytest.mark.parametrize("ends", [FORWARD, SIDEWAYS], ids=["forward", "sideways"])
+def test_common_covariance_moves_all_points_together(ends: object) -> None:
+    pair = Pair(ends, (LENS, LENS), {"own": OWN, "common": COMMON})  # type: ignore[arg-type]
+    points = pair.redrawn(np.random.default_rng(3), 2500, own=False, common=True, pixels=False)
+    predicted = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
+    assert_spread(points, predicted.common, 0.1)
+    together = pair.redrawn(np.random.default_rng(4), 2500, own=True, common=True, pixels=True)
+    assert_spread(together, predicted.own + predicted.common, 0.1)
+
+
+def test_a_point_lies_on_the_ref_ray_at_its_depth_and_where_it_was() -> None:
+    pair = Pair(FORWARD, (LENS, WIDE), {"own": OWN, "common": COMMON})
+    found = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
+    np.testing.assert_allclose(found.p_in_enu_m, pair.points, atol=1e-6)
+    ref, _ = pair.poses(np.zeros(18))
+    moved = pair.placed(np.zeros(18), pair.ref_px, pair.src_px + 3.0)
+    in_ref = (moved.p_in_enu_m - ref.centre) @ ref.rotation
+    np.testing.assert_allclose(LENS.project(in_ref), pair.ref_px, atol=1e-7)
+    assert np.abs(moved.p_in_enu_m - pair.points).max() > 0.1
+
+
+def test_covariances_are_symmetric_and_positive() -> None:
+    pair = Pair(SIDEWAYS, (LENS, LENS), {"own": OWN, "common": COMMON})
+    found = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
+    for covariance in (found.own, found.common):
+        np.testing.assert_allclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-12, atol=1e-18)
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+    # The error is longest along the line of sight.
+    ref, _ = pair.poses(np.zeros(18))
+    sight = found.p_in_enu_m - ref.centre
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    longest = np.linalg.eigh(found.own)[1][:, :, 2]
+    assert np.abs(np.sum(longest * sight, axis=1)).min() > 0.95
+
+
+# --- merging ---
+
+
+def covariances(rng: np.random.Generator, n: int, scale: float = 0.1) -> Floats:
+    a = rng.normal(0.0, scale, (n, 3, 3))
+    return a @ np.swapaxes(a, 1, 2) + 1e-4 * np.eye(3)
+
+
+def test_one_observation_stays_as_it_is() -> None:
+    rng = np.random.default_rng(5)
+    own, common = covariances(rng, 1), covariances(rng, 1, 1.0)
+    found = merge_voxels(np.array([[1.1, -2.2, 3.3]]), own, common, np.array([4]), np.array([2]), 0.25)
+    np.testing.assert_allclose(found.xyz, [[1.1, -2.2, 3.3]], atol=1e-12)
+    np.testing.assert_allclose(found.covariance, own + common, rtol=1e-9)
+    assert found.n_pairs.tolist() == [1]
+    assert found.best.tolist() == [0]
+
+
+def together(pairs: list[int], refs: list[int]) -> tuple[Merged, Floats, Floats]:
+    """Observations with equal covariance in one voxel."""
+    n = len(pairs)
+    own = np.broadcast_to(np.diag([0.04, 0.01, 0.09]), (n, 3, 3))
+    common = np.broadcast_to(np.diag([1.0, 2.0, 4.0]), (n, 3, 3))
+    xyz = 0.1 + 0.01 * np.arange(3.0 * n).reshape(n, 3) / n
+    return merge_voxels(xyz, own, common, np.array(pairs), np.array(refs), 1.0), own[0], common[0]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "refs", "n_pairs", "divided_by"),
+    [
+        ([7], [1], 1, 1),
+        ([7] * 5, [1] * 5, 1, 1),  # points of one pair share its error
+        ([7, 8], [1, 2], 2, 2),
+        ([7, 7, 7, 8], [1, 1, 1, 2], 2, 2),
+        ([7, 8, 9], [1, 1, 1], 3, 1),  # pairs of one ref frame share its error
+        ([7, 8, 9, 10], [1, 1, 2, 2], 4, 2),
+    ],
+)
+def test_how_far_the_covariance_shrinks(pairs: list[int], refs: list[int], n_pairs: int, divided_by: float) -> None:
+    found, own, common = together(pairs, refs)
+    assert found.n_pairs.tolist() == [n_pairs]
+    np.testing.assert_allclose(found.covariance[0], own / divided_by + common, rtol=1e-9)
+
+
+def test_pairs_weigh_by_their_information() -> None:
+    xyz = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2]])
+    own = np.stack([np.diag([0.01, 0.04, 0.01]), np.diag([0.04, 0.01, 0.01])])
+    common = np.stack([np.eye(3) * 5.0, np.eye(3) * 7.0])
+    found = merge_voxels(xyz, own, common, np.array([0, 1]), np.array([0, 1]), 1.0)
+    np.testing.assert_allclose(found.xyz[0], [0.12, 0.18, 0.15])
+    np.testing.assert_allclose(np.diag(found.covariance[0]), [0.008 + 5.0, 0.008 + 5.0, 0.005 + 5.0])
+    # A tie in variance is the first row's; a clear difference decides.
+    assert found.best.tolist() == [0]
+    better = merge_voxels(
+        xyz, own * np.array([1.0, 0.5])[:, None, None], common, np.array([0, 1]), np.array([0, 1]), 1.0
+    )
+    assert better.best.tolist() == [1]
+    assert better.covariance[0, 0, 0] > 7.0, "the common part of the best observation"
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 60), voxel=st.sampled_from([0.25, 0.5, 2.0]))
+def test_merging_keeps_its_promises(seed: int, n: int, voxel: float) -> None:
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-1.5, 1.5, (n, 3))
+    own, common = covariances(rng, n), covariances(rng, n, 1.0)
+    pair = rng.integers(0, 6, n)
+    ref = pair // 2
+    found = merge_voxels(xyz, own, common, pair, ref, voxel)
+
+    cells = np.floor(xyz / voxel).astype(int)
+    assert len(found.xyz) == len({tuple(c) for c in cells})
+    home = cells[found.best]
+    assert [tuple(c) for c in home] == sorted(tuple(c) for c in home), "in the order of the voxels"
+    for i, cell in enumerate(home):
+        members = np.flatnonzero((cells == cell).all(axis=1))
+        assert found.n_pairs[i] == len(set(pair[members]))
+        traces = np.trace(own[members], axis1=1, axis2=2)
+        assert np.trace(own[found.best[i]]) == traces.min()
+        extra = np.linalg.eigvalsh(found.covariance[i] - common[found.best[i]])
+        assert extra.min() > 0.0, "the common part never shrinks"
+        # No more information than the sum of the pairs', no less than the vaguest alone.
+        assert np.trace(found.covariance[i] - common[found.best[i]]) <= traces.max() * 3.0 + 1e-9
+
+    order = rng.permutation(n)
+    mixed = merge_voxels(xyz[order], own[order], common[order], pair[order], ref[order], voxel)
+    np.testing.assert_allclose(mixed.xyz, found.xyz, atol=1e-9)
+    np.testing.assert_allclose(mixed.covariance, found.covariance, rtol=1e-6)
+    assert (mixed.n_pairs == found.n_pairs).all()
+    assert (order[mixed.best] == found.best).all()
+
+
+def test_merged_points_are_as_far_off_as_they_say() -> None:
+    """Redraws of four pairs of two ref frames, whose errors are shared as documented."""
+    rng = np.random.default_rng(6)
+    truth, sigma = np.array([0.5, 0.5, 0.5]), np.array([0.02, 0.03, 0.05])
+    pair, ref = np.repeat([0, 1, 2, 3], 3), np.repeat([0, 0, 1, 1], 3)
+    own = np.broadcast_to(np.diag(sigma**2), (12, 3, 3))
+    common = np.zeros((12, 3, 3))
+    errors = []
+    for _ in range(1500):
+        of_ref = rng.normal(0.0, sigma, (2, 3))
+        found = merge_voxels(truth + of_ref[ref], own, common, pair, ref, 1.0)
+        errors.append(found.xyz[0] - truth)
+    predicted = np.sqrt(np.diag(found.covariance[0]))
+    np.testing.assert_allclose(np.std(errors, axis=0), predicted, rtol=0.07)

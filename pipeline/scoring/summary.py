@@ -50,22 +50,17 @@ def to_json(value: dict[str, Any]) -> str:
 
 
 def sentence(metrics: dict[str, Any]) -> str:
-    """The scores in a line for people: the published method beside the others, on the pixels all of them keep."""
+    """The scores in a line for people: each method on the pixels it keeps, the published one first."""
     published = metrics["calibration"]["method"]
-    others = [name for name in metrics["methods"] if name != published]
-    entry = metrics["methods"][published]
-    which = "common" if entry["common"]["n"] else "all"
-    against = ", ".join(f"{name} {_number(metrics['methods'][name][which]['abs_rel'])}" for name in others)
-    pixels = "pixels every method keeps" if which == "common" and others else "pixels"
-    return (
-        f"{published} AbsRel {_number(entry[which]['abs_rel'])}"
-        + (f" ({against})" if against else "")
-        + f" on {entry[which]['n']:,} {pixels}, {100.0 * (entry['kept_share'] or 0.0):.0f} % kept"
-    )
+    names = [published, *(name for name in metrics["methods"] if name != published)]
+    return "AbsRel " + ", ".join(f"{name} {_kept(metrics['methods'][name])}" for name in names)
 
 
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4f}"
+def _kept(entry: dict[str, Any]) -> str:
+    scores = entry["all"]
+    if not scores["n"]:
+        return "keeps nothing"
+    return f"{scores['abs_rel']:.4f} ({scores['n']:,} pixels, {100.0 * entry['kept_share']:.0f} %)"
 
 
 def _rounded(value: object) -> object:

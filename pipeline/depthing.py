@@ -123,9 +123,10 @@ def depths_by(
             rays.ref, rays.src, pose, fixed.get(method, view), rays.noise, virtual_baseline_m=virtual_baseline_m
         )
     kept, reason = _masked(found, rays, pose, limits)
-    return MethodDepths(
-        found, parallax(rays.ref, rays.src, pose), transfer_angle(rays.src, pose, found.normal), kept, reason
-    )
+    with np.errstate(invalid="ignore"):
+        # Where the view has no plane its normal is infinite, and the angle no number.
+        angle = transfer_angle(rays.src, pose, found.normal)
+    return MethodDepths(found, parallax(rays.ref, rays.src, pose), angle, kept, reason)
 
 
 def _masked(found: Depths, rays: MatchedRays, pose: RelativePose, limits: Limits) -> tuple[Bools, AnyArray]:

@@ -7,6 +7,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+import geopandas
 import laspy
 import numpy as np
 import pyarrow as pa
@@ -129,7 +130,6 @@ class TestPly:
 
 class TestGeoPackage:
     def test_opens_in_geopandas_with_its_compound_crs(self, points: Path, table: pa.Table, tmp_path: Path) -> None:
-        geopandas = pytest.importorskip("geopandas")
         export_points(points, tmp_path / "p.gpkg")
         frame = geopandas.read_file(tmp_path / "p.gpkg", layer="points")
         assert [part.to_epsg() for part in frame.crs.sub_crs_list] == [32617, 5703]
@@ -141,7 +141,6 @@ class TestGeoPackage:
 
     @pytest.mark.parametrize("datum", ["ellipsoidal", "takeoff"])
     def test_other_vertical_parts(self, tmp_path: Path, datum: str) -> None:
-        geopandas = pytest.importorskip("geopandas")
         crs = output_crs("auto", SITE, datum).crs
         write_points(tmp_path / "points", synthetic_columns(30), crs)
         export_points(tmp_path / "points", tmp_path / "p.gpkg")
@@ -178,7 +177,6 @@ class TestCsv:
 
 class TestParquet:
     def test_one_file_with_everything(self, points: Path, table: pa.Table, tmp_path: Path) -> None:
-        geopandas = pytest.importorskip("geopandas")
         export_points(points, tmp_path / "p.parquet")
         assert pq.read_metadata(tmp_path / "p.parquet").num_row_groups == 1
         one = PointDataset(tmp_path)

@@ -24,6 +24,10 @@ from pipeline.lidar.reference import NEIGHBOURS, reference_depth
 from pipeline.lidar.tile_crs import has_heights, tile_crs
 from pipeline.lidar.tiles import Tile, expand, read_returns, read_tile
 from pipeline.lidar.visibility import View, VisibleReturns, behind_columns, in_image, visible_returns
+from pipeline.simulation import tiles as simulation
+from pipeline.simulation.flight import fly
+from pipeline.simulation.render import CAMERA as LENS
+from pipeline.simulation.site import Site
 
 EVERYWHERE = np.full(2, -1e12), np.full(2, 1e12)
 CAMERA = Camera("pinhole", 800, 600, 700.0, 700.0, 399.5, 299.5)
@@ -412,11 +416,6 @@ def test_all_directions_are_looked_up_without_a_seam() -> None:
 
 @pytest.mark.slow
 def test_visibility_on_the_synthetic_site_against_its_rays() -> None:
-    simulation = pytest.importorskip("pipeline.simulation.tiles")
-    from pipeline.simulation.flight import fly  # noqa: PLC0415
-    from pipeline.simulation.render import CAMERA as LENS  # noqa: PLC0415
-    from pipeline.simulation.site import Site  # noqa: PLC0415
-
     site = Site.seeded(7)
     survey = simulation.survey(site)
     points = survey.p_in_enu_m[survey.classification != simulation.CLASS_NOISE]

@@ -17,7 +17,7 @@ from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bytes, Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, PoseSigmas, RelativePose, relative_pose
-from pipeline.geometry.rotations import enu_from_cam
+from pipeline.geometry.rotations import enu_from_cam, rotation_from_vector
 from pipeline.matching.features import Features, SiftExtractor, cached_features
 from pipeline.matching.guided import Band, EpipolarAngles, epipolar_angles, match_guided, rays_in_ref
 from pipeline.matching.images import read_colour, read_grey, shrunk_size, to_full_pixels
@@ -51,8 +51,9 @@ def pose(angles_deg: object, centre: object) -> Pose:
 
 
 def disturbed(rng: np.random.Generator, angles_deg: object, centre: object) -> Pose:
-    angles = np.asarray(angles_deg, np.float64) + np.degrees(rng.normal(0.0, OWN.gimbal_rad))
-    return pose(angles, np.asarray(centre, np.float64) + rng.normal(0.0, OWN.position_m))
+    true = pose(angles_deg, centre)
+    turn = rotation_from_vector(true.error_axes @ rng.normal(0.0, OWN.gimbal_rad))
+    return replace(true, rotation=turn @ true.rotation, centre=true.centre + rng.normal(0.0, OWN.position_m))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import os
 import sys
 from typing import Any
 
-import click
 import typer
 import typer.core
 import typer.main
@@ -36,7 +35,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 }
 
 
-class _Deferred(click.Command):
+class _Deferred(typer.core.TyperCommand):
     """A command that is known by name and help until it is called."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
@@ -92,12 +91,11 @@ def run(arguments: list[str]) -> int:
     try:
         command = typer.main.get_command(app)
         return int(command.main(arguments, prog_name="epitransfer", standalone_mode=False) or 0)
-    except click.ClickException as error:
-        error.show()
-        return error.exit_code
+    except typer.TyperException as error:
+        return _usage(error)
     except EpiTransferError as error:
         return _explain(error)
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         sys.stderr.write("interrupted; the same command carries on\n")
         return 130
     except MemoryError:
@@ -124,6 +122,8 @@ _REASONS = {
         "a file would be larger than allowed",
         "raise the limit (ulimit -f); the same command carries on",
     ),
+    errno.EMFILE: ("E-RES-05", "too many open files", "raise the limit (ulimit -n), or use --jobs 1"),
+    errno.EIO: ("E-RES-06", "the disk or network fails", "check it; the same command carries on"),
     errno.ENOTDIR: ("E-RES-04", "not a folder", "give a folder"),
 }
 
@@ -131,6 +131,16 @@ _REASONS = {
 def _resource(error: OSError) -> ResourceError:
     code, message, hint = _REASONS[error.errno or 0]
     return ResourceError(code, message, where=str(error.filename or ""), found=str(error), hint=hint)
+
+
+def _usage(error: typer.TyperException) -> int:
+    # The command's usage comes with it, where a command was found.
+    show = getattr(error, "show", None)
+    if show:
+        show()
+    else:
+        sys.stderr.write(f"error: {error}\n")
+    return error.exit_code
 
 
 def _explain(error: EpiTransferError) -> int:

@@ -9,9 +9,9 @@ import typer
 
 from pipeline.engine.config import load_workflow, parse_overrides, resolve, to_toml
 from pipeline.engine.digests import FileDigests
-from pipeline.engine.runfolder import RunFolder, write_json
+from pipeline.engine.runfolder import RunFolder, write_json, write_text
+from stages.options import Set
 from stages.registry import MODELS, STAGES
-from stages.run import Set
 
 
 def command(
@@ -24,7 +24,7 @@ def command(
     configuration = resolve(layers, MODELS)
     folder = RunFolder(run)
     with folder.locked():
-        folder.workflow.write_text(to_toml(configuration.given), encoding="utf-8")
+        write_text(folder.workflow, to_toml(configuration.given))
         digests = FileDigests(folder.cache / "digests.json")
         for name, config in configuration.sections.items():
             stage = STAGES[name]

@@ -12,12 +12,9 @@ from pipeline.engine.config import Sections, absolute_paths, load_workflow, pars
 from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
+from stages.options import Jobs, Scheduler, Set
 from stages.registry import MODELS, STAGES
 from stages.workflow import chosen_stages, execute
-
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override section.key; repeatable.")]
-Jobs = Annotated[int | None, typer.Option(min=1, help="Processes; all cores by default.")]
-Scheduler = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to run the shards on.")]
 
 
 def command(

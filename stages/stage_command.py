@@ -11,8 +11,8 @@ import typer
 from pipeline.engine.config import Sections, absolute_paths, load_workflow, parse_overrides, resolve
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
+from stages.options import Jobs, Scheduler, Set
 from stages.registry import MODELS, STAGES
-from stages.run import Jobs, Scheduler, Set
 from stages.workflow import execute, kept_sections
 
 Run = Annotated[Path, typer.Argument(help="Run folder.")]

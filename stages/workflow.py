@@ -9,7 +9,7 @@ from pipeline.engine.config import Configuration, Sections, load_workflow, resol
 from pipeline.engine.errors import TooManyFailuresError, UsageError
 from pipeline.engine.executors import executor_for
 from pipeline.engine.progress import Reporter
-from pipeline.engine.runfolder import RunFolder
+from pipeline.engine.runfolder import RunFolder, write_text
 from pipeline.engine.runner import run_stage, staleness
 from stages.registry import MODELS, STAGES
 
@@ -84,7 +84,7 @@ def execute(
     reporter = Reporter()
     records: dict[str, Any] = {}
     with folder.locked(), executor_for(jobs, scheduler) as executor:
-        folder.workflow.write_text(to_toml(configuration.given), encoding="utf-8")
+        write_text(folder.workflow, to_toml(configuration.given))
         for name in names:
             stage = STAGES[name]
             record = folder.record(name)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine.errors import UsageError
+from pipeline.engine.errors import ResourceError, UsageError
 from schemas import TABLES
 
 RECORD = "record.json"
@@ -72,9 +72,21 @@ class RunFolder:
 
         Raises:
             UsageError: Another process holds it.
+            ResourceError: It cannot be made or written.
         """
-        self.root.mkdir(parents=True, exist_ok=True)
-        with (self.root / ".lock").open("w") as lock:
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            lock = (self.root / ".lock").open("w")
+        except OSError as error:
+            raise ResourceError(
+                "E-RUN-10",
+                "the run folder cannot be written",
+                where=str(self.root),
+                found=error.strerror or str(error),
+                expected="a folder that may be made or written",
+                hint="give another --out",
+            ) from error
+        with lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -150,10 +162,18 @@ def tree_size(path: Path) -> int:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON atomically."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("w", encoding="utf-8") as stream:
-        json.dump(value, stream, indent=1, sort_keys=False, default=str)
-        stream.write("\n")
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
+    write_text(path, json.dumps(value, indent=1, sort_keys=False, default=str) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file atomically: a full disk or a kill leaves the old one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -222,6 +222,13 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 def _explained(name: str, error: ValidationError, origins: Mapping[str, str]) -> UsageError:
     first = error.errors()[0]
     key = ".".join(str(part) for part in (name, *first["loc"][:1]))
+    if first["type"] == "missing":
+        return UsageError(
+            "E-CONFIG-08",
+            f"{key} has no value",
+            where=f"[{name}]",
+            hint=f"put it into the workflow, or give --set {key}=...",
+        )
     return UsageError(
         "E-CONFIG-07",
         f"{key} has a value that is not allowed",

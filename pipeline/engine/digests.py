@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +68,8 @@ class FileDigests:
             if known and known[:2] == stamp:
                 return str(known[2])
             value = digest_file(text)
-        except (FileNotFoundError, PermissionError):
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError):
+            # Who reads it will say what is wrong.
             return "missing"
         self._known[text] = [*stamp, value]
         return value
@@ -77,8 +80,13 @@ class FileDigests:
         return {"files": len(entries), "sha256": digest_json(entries)}
 
     def save(self) -> None:
-        """Writes what was learnt."""
-        self._store.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self._store.with_suffix(".tmp")
-        temporary.write_text(json.dumps(self._known, sort_keys=True))
-        temporary.replace(self._store)
+        """Writes what was learnt, where that is possible: a read-only or full disk only costs the next reader time."""
+        # A name of its own: `status` may be asked for while a run goes on.
+        temporary = self._store.with_name(f".{self._store.name}.{os.getpid()}.tmp")
+        try:
+            self._store.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(self._known, sort_keys=True))
+            temporary.replace(self._store)
+        except OSError:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)

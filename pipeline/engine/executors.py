@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
+from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
-from pipeline.engine.errors import MissingPartError, ResourceError
+from pipeline.engine.errors import MissingPartError, ResourceError, UsageError
 from pipeline.engine.threads import limit_threads
 
 Item = TypeVar("Item")
@@ -64,6 +67,7 @@ class ProcessExecutor:
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._pool: ProcessPoolExecutor | None = None
+        self._others: frozenset[BaseProcess] = frozenset()
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """As `Executor.map`; no more than two shards per process wait, so memory does not grow with the flight.
@@ -74,7 +78,8 @@ class ProcessExecutor:
         if self._pool is None:
             # forkserver: a fork of this process would carry the locks of its threads along.
             context = multiprocessing.get_context("forkserver")
-            self._pool = ProcessPoolExecutor(self._jobs, mp_context=context, initializer=limit_threads)
+            self._others = frozenset(multiprocessing.active_children())
+            self._pool = ProcessPoolExecutor(self._jobs, mp_context=context, initializer=_begin_worker)
         source = iter(items)
         waiting: deque[Future[Result]] = deque(
             self._pool.submit(function, item) for item in islice(source, 2 * self._jobs)
@@ -98,9 +103,31 @@ class ProcessExecutor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._pool is None:
+            return
+        if kind is not None:
+            # Nobody waits for the shards that are still being worked on.
+            for worker in frozenset(multiprocessing.active_children()) - self._others:
+                worker.terminate()
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    limit_threads()
+    # An interrupt goes to the whole process group; the parent alone decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Ends this worker when its parent is killed: it would wait for work for ever, or write beside the next run."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 class DaskExecutor:
@@ -111,6 +138,7 @@ class DaskExecutor:
 
     Raises:
         MissingPartError: Dask is not installed.
+        UsageError: The address is none.
         ResourceError: No scheduler answers there.
     """
 
@@ -123,20 +151,44 @@ class DaskExecutor:
             ) from error
         try:
             self._client: Any = distributed.Client(address, timeout=10)
+        except ValueError as error:
+            raise UsageError(
+                "E-EXEC-04",
+                "--scheduler is no address",
+                where=address,
+                found=str(error),
+                expected="tcp://host:8786",
+                hint="check --scheduler",
+            ) from error
         except (OSError, TimeoutError) as error:
             raise ResourceError(
                 "E-EXEC-03", "no Dask scheduler answers", where=address, found=str(error), hint="check --scheduler"
             ) from error
+        self._address = address
+        self._lost = (distributed.KilledWorker, distributed.comm.CommClosedError, CancelledError)
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """As `Executor.map`."""
+        """As `Executor.map`.
+
+        Raises:
+            ResourceError: A worker or the scheduler was lost.
+        """
         source = iter(items)
         ahead = 2 * max(1, sum(self._client.nthreads().values()))
         waiting: deque[Any] = deque(self._client.submit(function, item, pure=False) for item in islice(source, ahead))
-        while waiting:
-            result: Result = waiting.popleft().result()
-            waiting.extend(self._client.submit(function, item, pure=False) for item in islice(source, 1))
-            yield result
+        try:
+            while waiting:
+                result: Result = waiting.popleft().result()
+                waiting.extend(self._client.submit(function, item, pure=False) for item in islice(source, 1))
+                yield result
+        except self._lost as error:
+            raise ResourceError(
+                "E-EXEC-05",
+                "the Dask cluster lost a worker or its scheduler",
+                where=self._address,
+                found=f"{type(error).__name__}: {error}",
+                hint="see the workers' memory; the same command carries on",
+            ) from error
 
     def __enter__(self) -> Self:
         return self

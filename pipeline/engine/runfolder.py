@@ -20,6 +20,7 @@ from pipeline.engine.errors import ResourceError, UsageError
 from schemas import TABLES
 
 RECORD = "record.json"
+FAILURE = "failure.txt"
 DATASETS = frozenset({"matches", "depths", "points", "scores"})
 
 
@@ -108,6 +109,10 @@ class RunFolder:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
+    def failure(self, stage: str, key: str) -> Path:
+        """Where the error of the last attempt with this key is kept until it is tried again."""
+        return self.root / ".work" / f"{stage}-{key[:16]}" / FAILURE
+
     def commit(self, stage: str, work: Path, record: dict[str, Any]) -> None:
         """Puts a stage's outputs in place together with its record."""
         write_json(work / RECORD, record)
@@ -167,7 +172,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Writes a text file atomically: a full disk or a kill leaves the old one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
         with temporary.open("w", encoding="utf-8") as stream:
             stream.write(text)

@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -19,12 +20,12 @@ import pyarrow.parquet as pq
 
 from pipeline.engine.config import Configuration, is_path
 from pipeline.engine.digests import FileDigests, digest_json, digest_tree
-from pipeline.engine.errors import InputError
+from pipeline.engine.errors import EpiTransferError, InputError
 from pipeline.engine.executors import Executor
 from pipeline.engine.progress import Reporter
-from pipeline.engine.runfolder import DATASETS, RunFolder, output_name, tree_size
+from pipeline.engine.runfolder import DATASETS, RunFolder, output_name, tree_size, write_text
 from pipeline.engine.stage import Stage
-from pipeline.engine.tables import parquet_files, read_table, write_table
+from pipeline.engine.tables import check_stored, parquet_files, read_table, write_table
 from schemas import TABLES
 
 Item = TypeVar("Item")
@@ -37,8 +38,8 @@ class State:
 
     Args:
         name: The stage.
-        status: "fresh", "stale" or "missing".
-        because: Which keys or inputs changed; empty when fresh.
+        status: "fresh", "stale", "missing", or "failed" when the last attempt with this key ended in an error.
+        because: Which keys or inputs changed, or the error; empty when fresh.
         key: The staleness key.
         parts: What the key is made of.
     """
@@ -55,6 +56,9 @@ def staleness(stage: Stage, folder: RunFolder, configuration: Configuration) -> 
     parts = _key_parts(stage, folder, configuration)
     key = digest_json(parts)
     record = folder.record(stage.name)
+    failure = folder.failure(stage.name, key)
+    if failure.exists():
+        return State(stage.name, "failed", failure.read_text(encoding="utf-8").splitlines()[0], key, parts)
     if record is None:
         return State(stage.name, "missing", "never run", key, parts)
     if record["key"] != key:
@@ -79,7 +83,11 @@ def _key_parts(stage: Stage, folder: RunFolder, configuration: Configuration) ->
         parts[f"facts of {upstream}"] = digest_json((folder.record(upstream) or {}).get("facts", {}))
     for name in stage.inputs:
         parts[name] = _input_digest(folder, name)
-    sources = stage.sources(config)
+    try:
+        sources = stage.sources(config)
+    except InputError as error:
+        # Whether outputs are fresh can be asked without the sources at hand; running the stage tells what is missing.
+        parts["sources"], sources = error.message, ()
     if sources:
         digests = FileDigests(folder.cache / "digests.json")
         parts["sources"] = digests.of_all(sources)
@@ -120,13 +128,21 @@ def run_stage(
                 where=str(folder.output(name)),
                 hint=f"epitransfer run ... --to {stage.name}",
             )
+        check_stored(folder.output(name), name.rstrip("/"))
     work = folder.work(stage.name, state.key)
     context = _StageContext(stage, folder, configuration, executor, reporter, work)
     for name in stage.outputs:
         if output_name(name) in DATASETS:
             (work / output_name(name)).mkdir(exist_ok=True)
     began = time.monotonic()
-    summary = stage.run(configuration.sections[stage.name], context)
+    failure = folder.failure(stage.name, state.key)
+    failure.unlink(missing_ok=True)
+    try:
+        summary = stage.run(configuration.sections[stage.name], context)
+    except EpiTransferError as error:
+        with suppress(OSError):
+            write_text(failure, f"{error}\n")
+        raise
     record = {
         "version": stage.version,
         "summary": summary,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -44,10 +46,37 @@ def read_table(path: Path, name: str) -> pa.Table:
     files = parquet_files(path)
     if not path.exists():
         raise InputError("E-TABLE-01", f"the table {name} is missing", where=str(path), hint="run the stage before")
+    tables = []
+    for file in files:
+        with explained(file, name):
+            tables.append(pq.read_table(file, partitioning=None))
+            schema.check_schema(tables[-1].schema)
+    return pa.concat_tables(tables) if tables else schema.empty()
+
+
+def check_stored(path: Path, name: str) -> None:
+    """Compares the schemas of a table's or dataset's files with the table's; reads no rows.
+
+    Raises:
+        InputError: Unreadable, or not of the schema `name`.
+    """
+    for file in parquet_files(path):
+        # Extension types (the geometry) are compared by what they store.
+        with explained(file, name), pq.ParquetFile(file, arrow_extensions_enabled=False) as stored:
+            TABLES[name].check_schema(stored.schema_arrow)
+
+
+@contextmanager
+def explained(path: Path, name: str) -> Iterator[None]:
+    """Turns what Arrow raises on a damaged file of a table into an error that names it.
+
+    Raises:
+        InputError: Unreadable, or not of the schema `name`.
+    """
     try:
-        tables = [pq.read_table(file, partitioning=None) for file in files]
-        table = pa.concat_tables(tables) if tables else schema.empty()
-        schema.check_schema(table.schema)
+        yield
+    except MemoryError:
+        raise
     except SchemaError as error:
         raise InputError(
             "E-TABLE-02",
@@ -56,7 +85,7 @@ def read_table(path: Path, name: str) -> pa.Table:
             found=str(error),
             hint="rerun the stage that writes it",
         ) from error
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OSError) as error:
+    except (pa.ArrowException, OSError) as error:
         raise InputError(
             "E-TABLE-03",
             f"the table {name} cannot be read",
@@ -64,4 +93,3 @@ def read_table(path: Path, name: str) -> pa.Table:
             found=str(error),
             hint="rerun the stage that writes it",
         ) from error
-    return table

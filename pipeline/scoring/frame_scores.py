@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
+from pipeline.engine.tables import explained
 from pipeline.geometry.arrays import Floats
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
 from pipeline.lidar.nearby import LocalTiles, returns_near
@@ -106,8 +107,10 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
         UndeterminedError: A height datum or the geoid between two is not known.
     """
     ids = pa.array([item.frame_id for item in items])
-    dataset = ds.dataset(job.depths, format="parquet")
-    rows = align(dataset.to_table(columns=_COLUMNS, filter=ds.field("frame_id").isin(ids)), job.methods)
+    with explained(job.depths, "depths"):
+        dataset = ds.dataset(job.depths, format="parquet")
+        depths = dataset.to_table(columns=_COLUMNS, filter=ds.field("frame_id").isin(ids))
+    rows = align(depths, job.methods)
     centres = np.array([item.view.centre_in_enu_m for item in items])
     near = _Surroundings.of(returns_near(job.tiles, centres, job.max_range_m))
     tables, scores = [], []
@@ -125,17 +128,19 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
 
 def methods_of(depths: Path, published: str) -> tuple[str, ...]:
     """The methods in a dataset `depths`: the published one first where it is there, the others by name."""
-    names: set[str] = set()
-    for batch in ds.dataset(depths, format="parquet").to_batches(columns=["method"]):
-        names.update(pc.unique(batch.column("method")).to_pylist())
-    return tuple(sorted(names, key=lambda name: (name != published, name)))
+    return tuple(sorted(_distinct(depths, "method"), key=lambda name: (name != published, name)))
 
 
 def frames_in(depths: Path) -> set[str]:
     """The ref frames in a dataset `depths`."""
+    return _distinct(depths, "frame_id")
+
+
+def _distinct(depths: Path, column: str) -> set[str]:
     names: set[str] = set()
-    for batch in ds.dataset(depths, format="parquet").to_batches(columns=["frame_id"]):
-        names.update(pc.unique(batch.column("frame_id")).to_pylist())
+    with explained(depths, "depths"):
+        for batch in ds.dataset(depths, format="parquet").to_batches(columns=[column]):
+            names.update(pc.unique(batch.column(column)).to_pylist())
     return names
 
 

@@ -31,7 +31,7 @@ example: example/workflow.toml
 ifdef WORKFLOW
 include workflows/rules.mk
 run: $(RECORDS)
-	@$(BIN)/epitransfer status $(OUT)
+	@$(BIN)/epitransfer run $(OUT)/workflow.toml --out $(OUT)
 else
 run:
 	@echo "usage: make run WORKFLOW=workflows/NAME.toml [OUT=folder]" >&2; exit 2

@@ -29,10 +29,10 @@ from pipeline.flight import (
     selected_pairs,
 )
 from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.cameras import PixelSigma
 from pipeline.geometry.poses import Pose, relative_pose
 from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.geometry.transfer import VirtualView
-from pipeline.matching.images import PixelSigma
 
 METHODS = {"adaptive": "epitransfer", "DLT": "dlt"}
 REDRAWS, MATCHES_PER_PAIR, SEED = 200, 100, 11

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.transfer import (
     Depths,
@@ -19,7 +19,6 @@ from pipeline.geometry.transfer import (
     variance_at,
 )
 from pipeline.geometry.triangulation import dlt_depth
-from pipeline.matching.images import PixelSigma
 
 METHODS = ("epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical")
 NO_DEPTH = "the rays do not meet in front of the cameras"

@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "export": ("stages.export", "command", "Points in another format: laz, las, ply, gpkg, csv, parquet."),
     "example": ("stages.example", "command", "Write a small synthetic flight with its truth."),
     "inspect": ("stages.inspect", "command", "Tell what a photo folder, log, tile or table holds."),
-    "configure": ("stages.configure", "command", "Keep a workflow in a run folder, with each stage's slice for Make."),
+    "configure": ("stages.configure", "command", "Keep a workflow in a run folder, with slices of it for Make."),
     "status": ("stages.status", "command", "Tell which stages are fresh, stale or missing, and why."),
     "schema": ("stages.schema", "command", "Show the tables: column, type, unit, frame, meaning."),
     "doctor": ("stages.doctor", "command", "Check versions, optional parts, PROJ grids, disk and memory."),
@@ -55,6 +55,19 @@ class _Commands(typer.core.TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         del ctx
         return _Deferred(cmd_name, help=COMMANDS[cmd_name][2]) if cmd_name in COMMANDS else None
+
+    def invoke(self, ctx: Any) -> Any:
+        # Typer would end an interrupt without a word, and a closed pipe with the exit code of a bug.
+        try:
+            outcome = super().invoke(ctx)
+            sys.stdout.flush()
+        except KeyboardInterrupt as interrupt:
+            raise typer.Abort from interrupt
+        except BrokenPipeError:
+            # The reader of our output is gone (a pipe into head), and nothing more can be said.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        return outcome
 
 
 # Plain help: rich's import alone would take a third of the time --help may take.
@@ -100,10 +113,6 @@ def run(arguments: list[str]) -> int:
         return 130
     except MemoryError:
         return _explain(ResourceError("E-RES-01", "out of memory", hint="use --jobs 1 or a smaller match.max_image_px"))
-    except BrokenPipeError:
-        # The reader of our output is gone (a pipe into head): not an error of ours, and nothing more can be said.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except OSError as error:
         return _explain(_resource(error)) if error.errno in _REASONS else _bug()
     except Exception:  # noqa: BLE001 - the one boundary where everything ends

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from pipeline.engine.config import load_workflow, parse_overrides, resolve, to_toml
-from pipeline.engine.digests import FileDigests
 from pipeline.engine.runfolder import RunFolder, write_json, write_text
+from pipeline.engine.runner import stage_slice
 from stages.options import Set
 from stages.registry import MODELS, STAGES
 
@@ -25,16 +25,9 @@ def command(
     folder = RunFolder(run)
     with folder.locked():
         write_text(folder.workflow, to_toml(configuration.given))
-        digests = FileDigests(folder.cache / "digests.json")
-        for name, config in configuration.sections.items():
-            stage = STAGES[name]
-            values = {f"{name}.{key}": value for key, value in config.model_dump(mode="json").items()}
-            values |= {key: configuration.value(key) for key in stage.reads}
-            _write_if_changed(
-                folder.root / ".slices" / f"{name}.json",
-                {"version": stage.version, "keys": values, "sources": digests.of_all(stage.sources(config))},
-            )
-        digests.save()
+        for name in configuration.sections:
+            parts = stage_slice(STAGES[name], folder, configuration)
+            _write_if_changed(folder.root / ".slices" / f"{name}.json", parts)
 
 
 def _write_if_changed(path: Path, value: object) -> None:

@@ -11,19 +11,17 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
 from pydantic import Field
 
 from pipeline.depthing import Limits, MatchedRays, MethodDepths, depths_by
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
-from pipeline.engine.tables import parquet_files, read_table
+from pipeline.engine.tables import dataset, parquet_files, read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, relative_poses_of, selected_pairs
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.transfer import VirtualView
-from pipeline.matching.images import PixelSigma
 from schemas import DEPTHS
 
 Method = Literal["epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"]
@@ -125,7 +123,7 @@ def _table(pair: PairRow, ref_px: Floats, method: str, found: MethodDepths) -> p
 
 
 def _summary(folder: Path, config: Config) -> str:
-    table = ds.dataset(folder, format="parquet").to_table(columns=["method", "kept", "reason"])
+    table = dataset(folder).to_table(columns=["method", "kept", "reason"])
     first = table.filter(pc.equal(table.column("method"), config.methods[0]))
     kept = pc.sum(first.column("kept")).as_py() or 0
     if not kept:

@@ -15,7 +15,7 @@ from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geodesy.crs import output_crs
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.matching.images import PixelSigma
+from pipeline.geometry.cameras import PixelSigma
 from pipeline.points.geoparquet import TileFile, write_dataset
 from pipeline.points.observations import Scene, fused_tile, observations, spill
 from pipeline.points.stac import item

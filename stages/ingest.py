@@ -70,7 +70,7 @@ def run(config: Config, context: Context) -> str:
     records: list[PhotoRecord] = []
     for part in context.map(partial(_read, calibration), locations, shard=_SHARD, label="photos"):
         records.extend(part)
-    root = common_root([*locations, *(file.location for file in marks)])
+    root = photo_root(config)
     found = assemble(
         records,
         marks,
@@ -93,6 +93,12 @@ def run(config: Config, context: Context) -> str:
         f"{usable.count(True)} of {len(usable)} photos usable, {found.cameras.num_rows} cameras, "
         f"heights {found.heights.stated}, {len(found.exposures.of_photo)} with RTK exposure marks"
     )
+
+
+def photo_root(config: Config) -> str:
+    """The deepest folder that holds all photos and exposure marks: the images' paths are relative to it."""
+    locations = find_images(_listed(config.photos))
+    return common_root([*locations, *beside(locations, MARK_SUFFIXES)])
 
 
 def sources(config: Config) -> Sequence[Path | str]:
@@ -153,4 +159,13 @@ def _warn_of_unusable(context: Context, found: Ingested, total: int) -> None:
         context.warn(f"{table.num_rows} of {total} photos are not usable, first {first['image']}: {first['problem']}")
 
 
-STAGE = Stage("ingest", 1, Config, (), ("frames", "cameras", "tracks", "clocks"), run, sources=sources)
+STAGE = Stage(
+    "ingest",
+    1,
+    Config,
+    (),
+    ("frames", "cameras", "tracks", "clocks"),
+    run,
+    sources=sources,
+    place=("photo_root", photo_root),
+)

@@ -15,7 +15,7 @@ def command(
 ) -> None:
     """Tell what sources hold: counts, time span, clock, poses, camera, heights, problems."""
     # The formats' libraries are heavy, and `--help` should not wait for them.
-    from pipeline.sources.inspection import describe  # noqa: PLC0415
+    from pipeline.inspection import describe  # noqa: PLC0415
 
     found = [item for name in source for item in describe(name)]
     if as_json:

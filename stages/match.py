@@ -13,6 +13,7 @@ from pydantic import Field
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
+from pipeline.engine.tables import dataset
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, relative_pose
@@ -136,9 +137,7 @@ def _table(pair_id: str, found: PairMatches) -> pa.Table:
 
 
 def _count(folder: Path) -> dict[str, tuple[int, int]]:
-    import pyarrow.dataset as ds  # noqa: PLC0415
-
-    table = ds.dataset(folder, format="parquet").to_table(columns=["pair_id", "inlier"])
+    table = dataset(folder).to_table(columns=["pair_id", "inlier"])
     grouped = table.group_by("pair_id").aggregate([("inlier", "count"), ("inlier", "sum")])
     return {row["pair_id"]: (row["inlier_count"], row["inlier_sum"]) for row in grouped.to_pylist()}
 

@@ -13,9 +13,8 @@ from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses_of, relative_pose_row, selected_pairs
 from pipeline.geometry.arrays import Floats
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import Pose, relative_pose
-from pipeline.matching.images import PixelSigma
 from pipeline.matching.verify import epipolar_residuals
 from schemas import MATCHES, POSES, RELATIVE_POSES
 

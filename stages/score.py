@@ -16,6 +16,7 @@ from pipeline.engine.errors import NothingLeftError, UndeterminedError
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.flight import camera_by_frame, cameras_of, poses_of
 from pipeline.geodesy.enu import LocalFrame
+from pipeline.geodesy.heights import RELATIVE, UNKNOWN
 from pipeline.geometry.arrays import Floats
 from pipeline.lidar.nearby import LocalTiles
 from pipeline.lidar.tiles import expand, read_tile
@@ -24,7 +25,6 @@ from pipeline.scoring.frame_scores import FrameScore, FrameView, ScoringJob, fra
 from pipeline.scoring.summary import metrics_object, sentence, to_json
 from schemas import SCORES
 
-PUBLISHED = "epitransfer"
 _FRAMES_PER_SHARD = 8
 
 
@@ -58,7 +58,7 @@ def run(config: Config, context: Context) -> str:
     job = ScoringJob(
         LocalTiles(meeting, tiles.frame, tiles.geoid, tiles.height_datum),
         depths,
-        methods_of(depths, PUBLISHED),
+        methods_of(depths, context.setting("depth.methods")[0]),
         config.max_range_m,
     )
     scores: list[FrameScore] = []
@@ -84,7 +84,7 @@ def _tiles(config: Config, context: Context) -> LocalTiles:
     """The tiles' headers, and the frame they are brought into."""
     frames = context.read("frames")
     datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
-    if len(datums) != 1 or datums[0] in ("unknown", "takeoff"):
+    if len(datums) != 1 or datums[0] in (*RELATIVE, UNKNOWN):
         raise UndeterminedError(
             "E-SCORE-02", "the flight's heights cannot be brought to those of LiDAR", where="frames, height_datum",
             found=", ".join(datums) or "no usable frame", expected="one datum that a geoid ties to the ellipsoid",
@@ -168,7 +168,7 @@ STAGE = Stage(
     ("frames", "cameras", "poses", "depths"),
     ("scores",),
     run,
-    reads=("ingest.geoid",),
+    reads=("ingest.geoid", "depth.methods"),
     facts_of=("ingest",),
     sources=sources,
 )

@@ -20,7 +20,8 @@ def kept_sections(folder: RunFolder) -> Sections:
     Raises:
         UsageError: The folder holds no run.
     """
-    if not folder.workflow.exists():
+    sections = load_workflow(folder.workflow, MODELS) if folder.workflow.exists() else {}
+    if not sections:
         raise UsageError(
             "E-RUN-04",
             "this folder holds no run",
@@ -28,7 +29,7 @@ def kept_sections(folder: RunFolder) -> Sections:
             expected="a folder with workflow.toml",
             hint="epitransfer run WORKFLOW.toml --out RUN, or epitransfer ingest RUN --workflow WORKFLOW.toml",
         )
-    return load_workflow(folder.workflow, MODELS)
+    return sections
 
 
 def kept_configuration(folder: RunFolder) -> Configuration:

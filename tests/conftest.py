@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+from flights import epitransfer, write_small_flight
 from hypothesis import settings
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -23,3 +24,18 @@ def shared() -> Path:
             pytest.fail(f"EPITRANSFER_SHARED={named} has no data folder")
         pytest.skip(f"no real photo sets at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An example flight of six small photos, with its tiles and workflow; not to be changed."""
+    return write_small_flight(tmp_path_factory.mktemp("flight") / "flight")
+
+
+@pytest.fixture(scope="session")
+def small_run(small_flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished, undisturbed run of `small_flight`; not to be changed."""
+    run = tmp_path_factory.mktemp("run") / "run"
+    done = epitransfer("run", small_flight / "workflow.toml", "--out", run, "--jobs", 1)
+    assert done.returncode == 0, done.stderr
+    return run

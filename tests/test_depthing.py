@@ -10,11 +10,10 @@ import pytest
 
 from pipeline.depthing import METHODS, NO_DEPTH, TOO_FAR, TOO_UNCERTAIN, Limits, MatchedRays, MethodDepths, depths_by
 from pipeline.geometry.arrays import Floats
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import Pose, PoseSigmas, RelativePose, relative_pose
 from pipeline.geometry.rotations import enu_from_cam
 from pipeline.geometry.transfer import VirtualView
-from pipeline.matching.images import PixelSigma
 
 DEG = np.pi / 180.0
 PLAIN = Camera("pinhole", 4000, 3000, 2800.0, 2810.0, 2010.0, 1490.0)

@@ -278,7 +278,7 @@ def test_tables_do_not_depend_on_the_place_of_the_folder(tmp_path: Path) -> None
     [
         ("FC6310", Fix(), "unknown", (1.5, 1.5, 3.0), (0.053, 0.053, 0.053)),
         ("FC6310", Fix(), "takeoff", (1.5, 1.5, 0.5), (0.053, 0.053, 0.053)),
-        ("FC6310", Fix(sigma_horizontal_m=2.1), "unknown", (2.1, 2.1, 2.1), (0.053, 0.053, 0.053)),
+        ("FC6310", Fix(sigma_horizontal_m=2.1), "unknown", (2.1, 2.1, 3.0), (0.053, 0.053, 0.053)),
         ("FC6310R", Fix(50, 0.01, 0.02, 0.03), "ellipsoidal", (0.01, 0.02, 0.03), (0.01, 0.02, 0.03)),
         ("FC6310R", Fix(34, 0.5, 0.6, 0.9), "ellipsoidal", (0.5, 0.6, 0.9), (0.053, 0.053, 0.053)),
         ("FC6310R", Fix(0, 0.5, 0.6, 0.9), "takeoff", (1.5, 1.5, 0.5), (0.053, 0.053, 0.053)),

@@ -215,9 +215,13 @@ def brute_matches(
     (ref_about, ref_along), (src_about, src_along) = (brute_angles(r, centre) for r in rays)
     turn = np.abs(np.angle(np.exp(1j * (ref_about[:, None] - src_about[None]))))
     rise = src_along[None] - ref_along[:, None]
-    slack = ref.slack[:, None]
+    slack = np.maximum(ref.slack[:, None], src.slack[None])
     with np.errstate(invalid="ignore"):
-        band = (turn <= ref.tolerance[:, None]) & (rise >= -slack) & (rise <= parallax + slack)
+        band = (
+            (turn <= np.maximum(ref.tolerance[:, None], src.tolerance[None]))
+            & (rise >= -slack)
+            & (rise <= parallax + slack)
+        )
     band &= np.isfinite(ref.about)[:, None] & np.isfinite(src.about)[None]
     masked = np.where(band, similarity, -np.inf)
     out = []
@@ -320,6 +324,32 @@ def test_the_width_of_the_band_is_that_of_redrawn_poses() -> None:
         about.append(epipolar_angles(seen, given_pose, BAND, 1 / 2800).about)
     spread = np.std(about, axis=0)
     np.testing.assert_allclose(band.tolerance / BAND.sigmas, spread, rtol=0.06)
+
+
+@pytest.mark.parametrize("offset", [(-15.0, 0.0, 0.3), (15.0, 0.0, 0.3), (0.0, 15.0, 0.0), (-5.0, 0.0, 0.0)])
+def test_the_band_is_wide_enough_whichever_way_and_however_far(offset: tuple[float, float, float]) -> None:
+    """Forward, backward and sideways, over all ranges looked for: true matches stay inside the band."""
+    rng = np.random.default_rng(11)
+    ref = pose((90.0, -20.0, 0.0), (0.0, 0.0, 31.0))
+    given_pose = relative_pose(ref, pose((91.0, -20.5, 0.0), (offset[0], offset[1], 31.0 + offset[2])))
+    rays = PLAIN.rays(rng.uniform((100.0, 1200.0), (3900.0, 2900.0), (60, 2)))
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    nearest = BAND.nearest_for(given_pose)
+    points = unit * (nearest / rng.uniform(0.05, 0.9, (60, 1)))
+    of_ref = epipolar_angles(unit, given_pose, BAND, 1 / 2800)
+    turns, widths = [], []
+    for _ in range(1500):
+        error = rng.multivariate_normal(np.zeros(6), given_pose.covariance)
+        seen = points - (given_pose.centre + error[3:])
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        seen = seen - np.cross(error[:3], seen) + rng.normal(0.0, 0.5 * np.sqrt(2.0) / 2800.0, seen.shape)
+        src = epipolar_angles(seen, given_pose, BAND, 1 / 2800)
+        turns.append(np.angle(np.exp(1j * (src.about - of_ref.about))))
+        widths.append(np.maximum(src.tolerance, of_ref.tolerance))
+    share = np.mean(np.abs(turns) <= np.array(widths), axis=0)
+    known = np.isfinite(of_ref.about) & np.isfinite(turns).all(axis=0)
+    assert known.sum() >= 40
+    assert share[known].min() > 0.995
 
 
 # --- residuals, duplicates, consensus ---

@@ -62,7 +62,12 @@ def load_workflow(path: Path, models: Models) -> Sections:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            "E-CONFIG-01", "cannot read the workflow file", where=str(path), found=str(error), hint="check the path"
+            "E-CONFIG-01",
+            "cannot read the workflow file",
+            where=str(path),
+            found=str(error),
+            expected="a TOML file",
+            hint="check the path",
         ) from error
     try:
         sections = tomllib.loads(text)

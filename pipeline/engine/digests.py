@@ -52,9 +52,11 @@ class FileDigests:
     def __init__(self, store: Path) -> None:
         self._store = store
         try:
-            self._known: dict[str, list[Any]] = json.loads(store.read_text())
+            stored = json.loads(store.read_text())
         except (OSError, ValueError):
-            self._known = {}
+            stored = None
+        entries = stored.items() if isinstance(stored, dict) else ()
+        self._known = {path: entry for path, entry in entries if isinstance(entry, list) and len(entry) == 3}
 
     def of(self, path: Path | str) -> str:
         """The digest of one file; a missing file has the digest "missing"."""
@@ -75,8 +77,11 @@ class FileDigests:
         return value
 
     def of_all(self, paths: Iterable[Path | str]) -> dict[str, Any]:
-        """Count and joint digest of several files, by content and file name, wherever they lie."""
-        entries = sorted([Path(str(path)).name, self.of(path)] for path in paths)
+        """Count and joint digest of files, by content and path below the folder they share, wherever that is."""
+        listed = [str(path) for path in paths]
+        folders = {os.path.dirname(text) for text in listed}  # noqa: PTH120 - URLs too
+        shared = os.path.commonpath(folders) if folders and not any("://" in text for text in listed) else ""
+        entries = sorted([os.path.relpath(text, shared) if shared else text, self.of(text)] for text in listed)
         return {"files": len(entries), "sha256": digest_json(entries)}
 
     def save(self) -> None:

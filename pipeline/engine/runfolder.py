@@ -55,10 +55,11 @@ class RunFolder:
     def record(self, stage: str) -> dict[str, Any] | None:
         """The record of the stage's last successful run."""
         try:
-            record: dict[str, Any] = json.loads(self.record_path(stage).read_text())
+            record = json.loads(self.record_path(stage).read_text())
         except (OSError, ValueError):
             return None
-        return record
+        # A damaged record is none: the stage runs again.
+        return record if isinstance(record, dict) and {"key", "parts", "outputs", "items"} <= record.keys() else None
 
     def intact(self, record: dict[str, Any]) -> bool:
         """Whether the outputs a record names are still there in their recorded size."""
@@ -147,7 +148,8 @@ class RunFolder:
 
     def write_manifest(self) -> None:
         """Gathers the records into manifest.json."""
-        records = {path.stem: json.loads(path.read_text()) for path in sorted((self.root / ".stages").glob("*.json"))}
+        found = {path.stem: self.record(path.stem) for path in sorted((self.root / ".stages").glob("*.json"))}
+        records = {stage: record for stage, record in found.items() if record is not None}
         ordered = dict(sorted(records.items(), key=lambda item: (item[1].get("position", 0), item[0])))
         write_json(self.root / "manifest.json", {"schema": 1, "stages": ordered})
 

@@ -28,6 +28,9 @@ from pipeline.engine.stage import Stage
 from pipeline.engine.tables import check_stored, parquet_files, read_table, write_table
 from schemas import TABLES
 
+# What changes no output, so that following a hint about it does not run the stage again.
+NOT_IN_KEY = frozenset({"max_failed_share"})
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -69,33 +72,51 @@ def staleness(stage: Stage, folder: RunFolder, configuration: Configuration) -> 
     return State(stage.name, "fresh", "", key, parts)
 
 
-def _key_parts(stage: Stage, folder: RunFolder, configuration: Configuration) -> dict[str, Any]:
+def stage_slice(stage: Stage, folder: RunFolder, configuration: Configuration) -> dict[str, Any]:
+    """What a stage's outputs depend on besides its input tables: its version, the keys it reads, its sources."""
     config = configuration.sections[stage.name]
+    digests = FileDigests(folder.cache / "digests.json")
     parts: dict[str, Any] = {"stage version": stage.version}
     for name, info in type(config).model_fields.items():
-        # Sources enter by content: a folder that moved is the same source.
-        if not is_path(info) or isinstance(getattr(config, name), int | float):
+        # Sources enter by content, below: a folder that moved is the same source.
+        if name not in NOT_IN_KEY and (not is_path(info) or isinstance(getattr(config, name), int | float)):
             parts[f"{stage.name}.{name}"] = config.model_dump(mode="json")[name]
     for key in stage.reads:
-        value = configuration.value(key)
-        parts[key] = value if not isinstance(value, tuple) else list(value)
-    for upstream in stage.facts_of:
-        parts[f"facts of {upstream}"] = digest_json((folder.record(upstream) or {}).get("facts", {}))
-    for name in stage.inputs:
-        parts[name] = _input_digest(folder, name)
+        parts[key] = _by_content(configuration, key, digests)
     try:
         sources = stage.sources(config)
+        if stage.place:
+            parts["place of the sources"] = stage.place[1](config)
     except InputError as error:
         # Whether outputs are fresh can be asked without the sources at hand; running the stage tells what is missing.
         parts["sources"], sources = error.message, ()
     if sources:
-        digests = FileDigests(folder.cache / "digests.json")
         parts["sources"] = digests.of_all(sources)
-        if folder.root.exists():
-            digests.save()
+    if folder.root.exists():
+        digests.save()
     # A trip through JSON, so that a key compares equal with the one kept in the record.
     plain: dict[str, Any] = json.loads(json.dumps(parts, default=str))
     return plain
+
+
+def _key_parts(stage: Stage, folder: RunFolder, configuration: Configuration) -> dict[str, Any]:
+    parts = stage_slice(stage, folder, configuration)
+    for upstream in stage.facts_of:
+        earlier = folder.record(upstream) or {}
+        facts = {key: value for key, value in earlier.get("facts", {}).items() if key != earlier.get("place")}
+        parts[f"facts of {upstream}"] = digest_json(facts)
+    for name in stage.inputs:
+        parts[name] = _input_digest(folder, name)
+    return parts
+
+
+def _by_content(configuration: Configuration, key: str, digests: FileDigests) -> Any:
+    """Another stage's value as it enters a key: a file by its bytes, all else as it is."""
+    value = configuration.value(key)
+    section, _, name = key.partition(".")
+    config = configuration.sections.get(section)
+    names_file = config is not None and is_path(type(config).model_fields[name]) and isinstance(value, str)
+    return digests.of(value) if names_file and Path(value).exists() else value
 
 
 def _input_digest(folder: RunFolder, name: str) -> str:
@@ -126,7 +147,8 @@ def run_stage(
                 "E-RUN-02",
                 f"{stage.name} needs {name}, which is not there",
                 where=str(folder.output(name)),
-                hint=f"epitransfer run ... --to {stage.name}",
+                expected="the table of an earlier stage",
+                hint=f"run the stages before {stage.name} first; a workflow needs a section for each of them",
             )
         check_stored(folder.output(name), name.rstrip("/"))
     work = folder.work(stage.name, state.key)
@@ -152,6 +174,7 @@ def run_stage(
         "outputs": {name: _output_entry(work, name) for name in stage.outputs},
         "items": context.items,
         "facts": context.facts_recorded,
+        "place": stage.place[0] if stage.place else None,
         "warnings": context.warnings,
         "seconds": round(time.monotonic() - began, 3),
         "peak_memory_mib": peak_memory_mib(),

@@ -105,6 +105,8 @@ class Stage:
         reads: Keys of other stages' configuration it reads, "ingest.geoid".
         facts_of: Stages whose recorded facts it reads; those facts are part of its staleness key.
         sources: Files from outside the run folder that it reads; their bytes are part of its staleness key.
+        place: The fact that tells where the sources lie, and how it follows from the configuration. The stage runs
+            again when they moved, to tell it anew; later stages do not, for what they were made from is the same.
     """
 
     name: str
@@ -116,3 +118,4 @@ class Stage:
     reads: tuple[str, ...] = ()
     facts_of: tuple[str, ...] = ()
     sources: Callable[[Any], Sequence[Path | str]] = field(default=no_sources)
+    place: tuple[str, Callable[[Any], str]] | None = None

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.dataset
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from pipeline.engine.errors import InputError
@@ -28,6 +28,7 @@ def write_table(path: Path, table: pa.Table) -> None:
         use_dictionary=texts,
         use_byte_stream_split=floats,
         row_group_size=_ROW_GROUP,
+        write_page_checksum=True,
     )
 
 
@@ -49,7 +50,7 @@ def read_table(path: Path, name: str) -> pa.Table:
     tables = []
     for file in files:
         with explained(file, name):
-            tables.append(pq.read_table(file, partitioning=None))
+            tables.append(pq.read_table(file, partitioning=None, page_checksum_verification=True))
             schema.check_schema(tables[-1].schema)
     return pa.concat_tables(tables) if tables else schema.empty()
 
@@ -58,12 +59,23 @@ def check_stored(path: Path, name: str) -> None:
     """Compares the schemas of a table's or dataset's files with the table's; reads no rows.
 
     Raises:
-        InputError: Unreadable, or not of the schema `name`.
+        InputError: No files, unreadable, or not of the schema `name`.
     """
-    for file in parquet_files(path):
+    files = parquet_files(path)
+    if not files:
+        raise InputError(
+            "E-TABLE-04", f"the table {name} has no parts", where=str(path), hint="rerun the stage that writes it"
+        )
+    for file in files:
         # Extension types (the geometry) are compared by what they store.
         with explained(file, name), pq.ParquetFile(file, arrow_extensions_enabled=False) as stored:
             TABLES[name].check_schema(stored.schema_arrow)
+
+
+def dataset(path: Path) -> ds.Dataset:
+    """A dataset's parts, to be read in pieces and with the checksums of their pages; within `explained`."""
+    options = ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+    return ds.dataset(path, format=ds.ParquetFileFormat(default_fragment_scan_options=options))
 
 
 @contextmanager

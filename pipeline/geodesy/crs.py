@@ -12,9 +12,6 @@ from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF, VERTICAL_EPSG
 from pipeline.geodesy.transform import CrsTransform, read_crs
 
-OutputCrs = CrsTransform
-"""What `output_crs` returns: the CRS and the way there and back."""
-
 # Vertical CRSs of no register, as WKT 2 (ISO 19162:2019, 10): zero is where the drone took off, or where the user says.
 _RELATIVE = {TAKEOFF: ("height above take-off", "take-off point"), LOCAL: ("local height", "local zero")}
 _VERTICAL_WKT = 'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["gravity-related height (H)",up],LENGTHUNIT["metre",1]]'
@@ -25,7 +22,7 @@ _AREA_MARGIN_DEG = 6.0
 
 def output_crs(
     crs: str, frame: LocalFrame, height_datum: str, geoid: float | str | Path | None = None, *, source_datum: str = ""
-) -> OutputCrs:
+) -> CrsTransform:
     """The CRS of the product, from the configuration and what ingest found.
 
     A CRS without a vertical part ("auto" is the UTM zone of the origin) gets the one of the source's heights:

@@ -182,6 +182,23 @@ class Camera:
         return xy.copy(), np.broadcast_to(np.eye(2), (*xy.shape, 2)).copy()
 
 
+@dataclass(frozen=True, slots=True)
+class PixelSigma:
+    """How well positions are matched.
+
+    Args:
+        sigma_px: One sigma per axis, in pixels of the size the image is matched at.
+        longest_px: Longest side images are matched at.
+    """
+
+    sigma_px: float
+    longest_px: int
+
+    def of(self, camera: Camera) -> float:
+        """One sigma per axis in pixels of the image as given."""
+        return self.sigma_px * max(1.0, max(camera.width, camera.height) / self.longest_px)
+
+
 def _brown(xy: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]:
     """OpenCV's rational model and its Jacobian (OpenCV documentation, calib3d, "Detailed Description")."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *([0.0] * 8))[:8]

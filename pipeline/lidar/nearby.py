@@ -77,7 +77,9 @@ def returns_near(local: LocalTiles, centres_in_enu_m: Floats, max_range_m: float
     stride, held = 1, 0
     transforms: dict[str, CrsTransform] = {}
     for tile in local.tiles:
-        transform = transforms.setdefault(tile.crs_wkt, local.transform(tile))
+        if tile.crs_wkt not in transforms:
+            transforms[tile.crs_wkt] = local.transform(tile)
+        transform = transforms[tile.crs_wkt]
         lower, upper = _box_in_crs(transform, centres_in_enu_m, max_range_m)
         if not tile.meets(lower, upper):
             continue

@@ -12,10 +12,8 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError
 
 from pipeline.engine.errors import UndeterminedError, UsageError
+from pipeline.geodesy.heights import ELLIPSOIDAL, VERTICAL_EPSG, height_datum
 
-# Names a user may state a height datum by; heights in metres.
-NAMED_DATUMS = {"egm96": "EPSG:5773", "egm2008": "EPSG:3855", "navd88": "EPSG:5703"}
-ELLIPSOIDAL = "ellipsoidal"
 # GeoTIFF keys (OGC 19-008r4, annex B; GeoTIFF 1.0 revision 1.8.2, 6.3.3 and 6.3.4).
 _GEODETIC, _PROJECTED, _VERTICAL, _VERTICAL_UNITS = 2048, 3072, 4096, 4099
 _FIRST_CODE, _LAST_CODE = 1024, 32766
@@ -100,9 +98,14 @@ def _from_geokeys(keys: dict[int, int], path: Path) -> pyproj.CRS | None:
     return _compound(horizontal, _parsed(f"EPSG:{vertical}", path), path)
 
 
-def _with_stated_heights(crs: pyproj.CRS, datum: str, path: Path) -> pyproj.CRS:
+def _with_stated_heights(crs: pyproj.CRS, stated: str, path: Path) -> pyproj.CRS:
+    try:
+        datum = height_datum(stated)
+    except UsageError:
+        # Not one of the names, so the code of a vertical CRS, or nothing that PROJ knows.
+        datum = stated
     metric = all(abs(axis.unit_conversion_factor - 1.0) < 1e-9 for axis in crs.axis_info) or crs.is_geographic
-    if datum in (ELLIPSOIDAL, *NAMED_DATUMS) and not metric:
+    if datum in (ELLIPSOIDAL, *VERTICAL_EPSG) and not metric:
         raise UndeterminedError(
             "E-LIDAR-05", "the tile is in feet, and whether its heights are too is not stated", where=str(path),
             found=f"{crs.name} in {crs.axis_info[0].unit_name}, heights from {datum}",
@@ -113,7 +116,7 @@ def _with_stated_heights(crs: pyproj.CRS, datum: str, path: Path) -> pyproj.CRS:
     if datum == ELLIPSOIDAL:
         return crs.to_3d()
     try:
-        vertical = pyproj.CRS.from_user_input(NAMED_DATUMS.get(datum, datum))
+        vertical = pyproj.CRS.from_user_input(VERTICAL_EPSG.get(datum, datum))
     except CRSError as error:
         raise _not_vertical(datum) from error
     if not vertical.is_vertical:
@@ -145,5 +148,5 @@ def _not_understood(path: Path, text: str, error: CRSError) -> UndeterminedError
 def _not_vertical(datum: str) -> UsageError:
     return UsageError(
         "E-LIDAR-07", "score.lidar_height_datum is not a height datum", found=datum,
-        expected=", ".join((ELLIPSOIDAL, *NAMED_DATUMS)) + " or the code of a vertical CRS, such as EPSG:6360",
+        expected=", ".join((ELLIPSOIDAL, *VERTICAL_EPSG)) + " or the code of a vertical CRS, such as EPSG:6360",
     )  # fmt: skip

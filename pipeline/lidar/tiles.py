@@ -102,21 +102,38 @@ def read_tile(path: Path, height_datum: str | None = None) -> Tile:
         InputError: Not a tile, or cut short.
         UndeterminedError: The CRS or its vertical part is not known.
     """
+    header = read_header(path)
+    lower, upper = (tuple(float(x) for x in corner) for corner in (header.mins, header.maxs))
+    crs = tile_crs(header, path, height_datum)
+    return Tile(
+        path,
+        crs.to_wkt(),
+        int(header.point_count),
+        (lower[0], lower[1], lower[2]),
+        (upper[0], upper[1], upper[2]),
+    )
+
+
+def read_header(path: Path) -> laspy.LasHeader:
+    """A tile's header with its records.
+
+    Raises:
+        InputError: Not a tile, cut short, or without finite bounds.
+    """
     check_public_header(path)
     try:
         with laspy.open(path, read_evlrs=True) as reader:
             header = reader.header
-            lower, upper = (tuple(float(x) for x in corner) for corner in (header.mins, header.maxs))
+            bounds = [float(x) for corner in (header.mins, header.maxs) for x in corner]
             count = int(header.point_count)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
-    crs = tile_crs(header, path, height_datum)
-    if count and not np.all(np.isfinite([*lower, *upper])):
+    if count and not np.all(np.isfinite(bounds)):
         raise InputError(
-            "E-LIDAR-08", "the tile's header has no finite bounds", where=str(path), found=f"{lower} .. {upper}",
+            "E-LIDAR-08", "the tile's header has no finite bounds", where=str(path), found=str(bounds),
             hint="rewrite it: pdal translate",
         )  # fmt: skip
-    return Tile(path, crs.to_wkt(), count, (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
+    return header
 
 
 def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_points: int = CHUNK_POINTS) -> Iterator[Floats]:

@@ -4,8 +4,8 @@ All points on one epipolar plane are seen at the same angle about the baseline, 
 images' features are put on two angles: `about`, the turn about the baseline, and `along`, the angle from the
 direction towards src. A match needs equal `about` within the band that the pose covariance allows, and `along` larger
 in src than in ref (a point in front of both cameras), by no more than the parallax of the nearest point that is
-looked for. One sort makes the band a short list of neighbours; lens distortion is already in the rays, so the band is
-exact.
+looked for. Sorted by `about`, a block of features has but few neighbours in reach; lens distortion is already in the
+rays, so the band is exact.
 """
 
 from __future__ import annotations
@@ -96,17 +96,21 @@ def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, pixel_rad: flo
     in_plane = np.cross(normal, rays)
     pixel = 2.0 * (band.sigma_px * pixel_rad) ** 2
     width, slack = (
-        band.sigmas * np.sqrt(_turn_variance(direction, rays, pose, band.nearest_for(pose)) + pixel)
+        band.sigmas * np.sqrt(_largest_turn_variance(direction, rays, pose, band.nearest_for(pose)) + pixel)
         for direction in (normal, in_plane)
     )
     return EpipolarAngles(np.where(width / safe < _WIDEST_BAND, about, np.nan), along, width / safe, slack)
 
 
-def _turn_variance(direction: Floats, rays: Floats, pose: RelativePose, range_m: float) -> Floats:
-    """Variance (rad^2) of the src ray's displacement along unit directions across it, at a range."""
+def _largest_turn_variance(direction: Floats, rays: Floats, pose: RelativePose, nearest_m: float) -> Floats:
+    """Largest variance (rad^2) of the src ray's displacement along unit directions across it, from a range to infinity.
+
+    It is a convex quadratic of the inverse range, so the largest is at one of the ends.
+    """
     turn = np.cross(rays, direction)
-    jacobian = np.concatenate([turn, direction / range_m], axis=1)
-    out: Floats = np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian)
+    ends = (np.concatenate([turn, direction * inverse], axis=1) for inverse in (0.0, 1.0 / nearest_m))
+    far, near = (np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian) for jacobian in ends)
+    out: Floats = np.maximum(far, near)
     return out
 
 
@@ -148,14 +152,10 @@ def match_guided(
         The matches, in order of the ref feature.
     """
     ref_order = _usable_order(ref)
-    src_order, src_about = _unrolled(src)
-    best = _Best(len(ref_descriptors), len(src_descriptors))
+    best = _Best(ref_descriptors, src_descriptors)
     for start in range(0, len(ref_order), _REF_BLOCK):
         rows = ref_order[start : start + _REF_BLOCK]
-        reach = float(ref.tolerance[rows].max())
-        low = np.searchsorted(src_about, ref.about[rows[0]] - reach)
-        high = np.searchsorted(src_about, ref.about[rows[-1]] + reach)
-        columns = np.unique(src_order[low:high])
+        columns = _in_reach(ref, src, rows)
         if columns.size:
             allowed = _allowed(ref, src, rows, columns, max_parallax_rad)
             similarity = ref_descriptors[rows] @ src_descriptors[columns].T
@@ -168,21 +168,25 @@ def _usable_order(angles: EpipolarAngles) -> Ints:
     return usable[np.argsort(angles.about[usable], kind="stable")]
 
 
-def _unrolled(angles: EpipolarAngles) -> tuple[Ints, Floats]:
-    """The order by angle, written three times so that a band across +-pi is one interval."""
-    order = _usable_order(angles)
-    about = angles.about[order]
-    turn = 2.0 * np.pi
-    return np.concatenate([order] * 3), np.concatenate([about - turn, about, about + turn])
+def _in_reach(ref: EpipolarAngles, src: EpipolarAngles, rows: Ints) -> Ints:
+    """The src features whose band may meet that of a block of ref features, which is sorted by `about`."""
+    first, last = ref.about[rows[0]], ref.about[rows[-1]]
+    apart = _turn(src.about - 0.5 * (first + last)) - 0.5 * (last - first)
+    return np.flatnonzero(apart <= np.maximum(src.tolerance, ref.tolerance[rows].max()))
+
+
+def _turn(angle: Floats) -> Floats:
+    """The size of an angle, across +-pi too."""
+    size = np.abs(angle)
+    return np.minimum(size, 2.0 * np.pi - size)
 
 
 def _allowed(ref: EpipolarAngles, src: EpipolarAngles, rows: Ints, columns: Ints, max_parallax: float) -> Bools:
-    turn = np.abs(ref.about[rows][:, None] - src.about[columns][None])
-    np.minimum(turn, 2.0 * np.pi - turn, out=turn)
-    # A point is farther from the baseline's direction in src than in ref, so the tolerance of ref covers both.
-    allowed = turn <= ref.tolerance[rows][:, None]
+    turn = _turn(ref.about[rows][:, None] - src.about[columns][None])
+    # The wider band is that of the image whose ray is nearer to the baseline: ref ahead of the epipole, src behind it.
+    allowed = turn <= np.maximum(ref.tolerance[rows][:, None], src.tolerance[columns][None])
     rise = src.along[columns][None] - ref.along[rows][:, None]
-    slack = ref.slack[rows][:, None]
+    slack = np.maximum(ref.slack[rows][:, None], src.slack[columns][None])
     out: Bools = allowed & (rise >= -slack) & (rise <= max_parallax + slack)
     return out
 
@@ -190,10 +194,13 @@ def _allowed(ref: EpipolarAngles, src: EpipolarAngles, rows: Ints, columns: Ints
 class _Best:
     """Best and second-best similarity of every ref feature, and the best ref feature of every src feature."""
 
-    def __init__(self, n_ref: int, n_src: int) -> None:
+    def __init__(self, ref_descriptors: Singles, src_descriptors: Singles) -> None:
+        n_ref, n_src = len(ref_descriptors), len(src_descriptors)
+        self.ref_descriptors, self.src_descriptors = ref_descriptors, src_descriptors
         self.first = np.full(n_ref, -1.0, np.float32)
         self.second = np.full(n_ref, -1.0, np.float32)
         self.column = np.full(n_ref, -1, np.int64)
+        self.second_column = np.full(n_ref, -1, np.int64)
         self.src_first = np.full(n_src, -1.0, np.float32)
         self.src_row = np.full(n_src, -1, np.int64)
 
@@ -208,16 +215,24 @@ class _Best:
         self.src_first[columns[better]] = value[better]
         self.src_row[columns[better]] = rows[back[better]]
         similarity[line, pick] = -1.0
-        self.second[rows] = similarity.max(axis=1)
+        pick = np.argmax(similarity, axis=1)
+        self.second[rows] = similarity[line, pick]
+        self.second_column[rows] = columns[pick]
 
     def matches(self, ratio: float) -> FoundMatches:
         rows = np.flatnonzero(self.first > 0.0)
         columns = self.column[rows]
         mutual = self.src_row[columns] == rows
         rows, columns = rows[mutual], columns[mutual]
-        near, far = (
-            np.sqrt(np.maximum(2.0 - 2.0 * s[rows].astype(np.float64), 0.0)) for s in (self.first, self.second)
-        )
+        alone = self.second[rows] <= 0.0
+        near, far = self._distances(rows, columns), self._distances(rows, self.second_column[rows])
+        far[alone] = 2.0
         score = 1.0 - near / np.maximum(far, 1e-12)
         good = score >= 1.0 - ratio
         return FoundMatches(rows[good], columns[good], score[good])
+
+    def _distances(self, rows: Ints, columns: Ints) -> Floats:
+        """Descriptor distances anew: the last digits of a matrix product depend on its blocks and threads."""
+        ref, src = self.ref_descriptors[rows].astype(np.float64), self.src_descriptors[columns].astype(np.float64)
+        out: Floats = np.sqrt(np.sum((ref - src) ** 2, axis=1))
+        return out

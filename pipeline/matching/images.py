@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,6 @@ import numpy as np
 
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bytes, Floats
-from pipeline.geometry.cameras import Camera
 
 
 def read_grey(path: Path | str) -> Bytes:
@@ -50,7 +48,13 @@ def _decode(path: Path | str, flags: int) -> Bytes:
             buffer.write(stream.read())
         image = cv2.imdecode(np.frombuffer(buffer.getbuffer(), np.uint8), flags) if buffer.tell() else None
     except (OSError, cv2.error) as error:
-        raise InputError("E-IMAGE-01", "cannot read the image", where=str(path), found=str(error)) from error
+        raise InputError(
+            "E-IMAGE-01",
+            "cannot read the image",
+            where=str(path),
+            found=str(error),
+            hint="run ingest again: was it moved?",
+        ) from error
     if image is None:
         raise InputError("E-IMAGE-02", "cannot decode the image", where=str(path), hint="is it a whole JPEG?")
     return np.asarray(image, np.uint8)
@@ -60,23 +64,6 @@ def shrunk_size(width: int, height: int, longest_px: int) -> tuple[int, int]:
     """The size an image is matched at: as it is, or its longer side brought to `longest_px`."""
     scale = min(1.0, longest_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
-
-
-@dataclass(frozen=True, slots=True)
-class PixelSigma:
-    """How well positions are matched.
-
-    Args:
-        sigma_px: One sigma per axis, in pixels of the size the image is matched at.
-        longest_px: Longest side images are matched at.
-    """
-
-    sigma_px: float
-    longest_px: int
-
-    def of(self, camera: Camera) -> float:
-        """One sigma per axis in pixels of the image as given."""
-        return self.sigma_px * max(1.0, max(camera.width, camera.height) / self.longest_px)
 
 
 def to_full_pixels(pixels: Floats, shrunk: tuple[int, int], full: tuple[int, int]) -> Floats:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Singles
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.features import Features
 from pipeline.matching.guided import Band, epipolar_angles, match_guided, rays_in_ref
-from pipeline.matching.images import PixelSigma
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
 
 

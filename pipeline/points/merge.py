@@ -1,4 +1,4 @@
-"""Merging the observations that fall into one voxel, by inverse variance and without counting an error twice."""
+"""Merging the observations in a voxel by inverse variance, without counting a shared pose error twice."""
 
 from __future__ import annotations
 
@@ -26,19 +26,21 @@ class Merged:
     best: Ints
 
 
-def merge_voxels(xyz: Floats, own: Floats, common: Floats, pair: Ints, ref: Ints, voxel_m: float) -> Merged:
+def merge_voxels(xyz: Floats, own: Floats, common: Floats, pair: Ints, frames: Ints, voxel_m: float) -> Merged:
     """Merges observations by voxel.
 
-    Points of one pair share that pair's pose error, so within a pair positions are averaged and the covariance is not
-    divided. Pairs are combined by inverse variance; those of one ref frame share its error and together count as one.
-    The common part is that of the best observation and never shrinks.
+    Every mean is weighted by one over the variance (the trace), not by the inverse matrix: that would throw a mean of
+    two long, nearly parallel ellipsoids out of the voxel they were found in. Points of one pair share that pair's pose
+    error, so within a pair the covariance is not divided. Pairs that share frames share their errors: they count as no
+    more independent ones than they have ref frames, src frames, or half their frames. The common part is that of the
+    best observation and never shrinks.
 
     Args:
         xyz: (n, 3) in the dataset's CRS, m.
         own: (n, 3, 3) m^2.
         common: (n, 3, 3) m^2.
         pair: (n,) number of the pair.
-        ref: (n,) number of the pair's ref frame.
+        frames: (n, 2) numbers of the pair's ref and src frame.
         voxel_m: Edge of a voxel.
 
     Returns:
@@ -48,28 +50,34 @@ def merge_voxels(xyz: Floats, own: Floats, common: Floats, pair: Ints, ref: Ints
     _, voxel = np.unique(voxels, axis=0, return_inverse=True)
     voxel = voxel.reshape(-1)
     _, first, of_pair = np.unique(np.stack([voxel, pair], axis=1), axis=0, return_index=True, return_inverse=True)
-    pair_xyz, pair_own = _average(xyz, own, of_pair.reshape(-1))
-    pair_voxel, pair_ref = voxel[first], ref[first]
-    information = np.linalg.inv(pair_own)
-    weighted = np.einsum("nij,nj->ni", information, pair_xyz)
-    total, pulled = _sum(information, pair_voxel), _sum(weighted, pair_voxel)
+    of_pair = of_pair.reshape(-1)
+    share = _shares(own, of_pair)
+    pair_xyz, pair_own = _sum(xyz * share[:, None], of_pair), _sum(own * share[:, None, None], of_pair)
+    pair_voxel = voxel[first]
+    share = _shares(pair_own, pair_voxel)
+    covariance = _sum(pair_own * (share**2)[:, None, None], pair_voxel)
     n_pairs = np.bincount(pair_voxel)
-    n_refs = np.bincount(np.unique(np.stack([pair_voxel, pair_ref], axis=1), axis=0)[:, 0])
-    covariance = np.linalg.inv(total)
+    either = _distinct(np.tile(voxel, 2), frames.T.reshape(-1))
+    independent = np.minimum(np.minimum(_distinct(voxel, frames[:, 0]), _distinct(voxel, frames[:, 1])), either / 2.0)
     best = _least(np.trace(own, axis1=1, axis2=2), voxel)
     return Merged(
-        np.einsum("nij,nj->ni", covariance, pulled),
-        covariance * (n_pairs / n_refs)[:, None, None] + common[best],
+        _sum(pair_xyz * share[:, None], pair_voxel),
+        covariance * (n_pairs / independent)[:, None, None] + common[best],
         n_pairs,
         best,
     )
 
 
-def _average(xyz: Floats, own: Floats, group: Ints) -> tuple[Floats, Floats]:
+def _shares(own: Floats, group: Ints) -> Floats:
+    """Weights by one over the trace that add up to 1 in each group."""
     weight = 1.0 / np.trace(own, axis1=1, axis2=2)
-    total = np.bincount(group, weight)
-    share = weight / total[group]
-    return _sum(xyz * share[:, None], group), _sum(own * share[:, None, None], group)
+    out: Floats = weight / np.bincount(group, weight)[group]
+    return out
+
+
+def _distinct(group: Ints, values: Ints) -> Ints:
+    """How many different values each group has."""
+    return np.bincount(np.unique(np.stack([group, values], axis=1), axis=0)[:, 0])
 
 
 def _sum(values: AnyArray, group: Ints) -> Floats:

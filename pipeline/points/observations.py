@@ -14,12 +14,12 @@ from pyarrow import feather
 from pipeline.flight import PairRow, column, columns
 from pipeline.geodesy.transform import CrsTransform
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import Pose
-from pipeline.matching.images import PixelSigma, read_colour
+from pipeline.matching.images import read_colour
 from pipeline.points.geoparquet import tile_table
 from pipeline.points.merge import merge_voxels
-from pipeline.points.tiles import tile_corners, tile_name, tile_order
+from pipeline.points.tiles import split, tile_corners, tile_order
 from pipeline.points.world import Shot, world_points
 
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -106,12 +106,11 @@ def spill(table: pa.Table, folder: Path, name: str, tile_m: int) -> None:
     """Writes observations to one file per tile: FOLDER/TILE/NAME."""
     if not table.num_rows:
         return
-    corners, of_row = np.unique(tile_corners(_matrix(table, "xyz"), tile_m), axis=0, return_inverse=True)
-    for index, corner in enumerate(corners):
-        place = folder / tile_name(corner) / name
+    for tile, rows in split(_matrix(table, "xyz"), tile_m):
+        place = folder / tile / name
         place.parent.mkdir(parents=True, exist_ok=True)
         temporary = place.with_suffix(".tmp")
-        feather.write_feather(table.filter(of_row.reshape(-1) == index), temporary, compression="uncompressed")
+        feather.write_feather(table.take(rows), temporary, compression="uncompressed")
         temporary.replace(place)
 
 
@@ -130,10 +129,11 @@ def fused_tile(scene: Scene, folder: Path, voxel_m: float, min_observations: int
     """
     table = pa.concat_tables([feather.read_table(file) for file in sorted(folder.glob("*.arrow"))])
     xyz = _matrix(table, "xyz")
-    pair, ref = (column(table, name) for name in ("pair_id", "frame_id"))
-    codes = [np.unique(values, return_inverse=True)[1].reshape(-1) for values in (pair, ref)]
+    ids, pair = np.unique(column(table, "pair_id"), return_inverse=True)
+    of_id = [(scene.pairs[name].ref, scene.pairs[name].src) for name in ids]
+    frames = np.unique(np.array(of_id), return_inverse=True)[1].reshape(-1, 2)[pair]
     merged = merge_voxels(
-        xyz, _unpacked(_matrix(table, "own")), _unpacked(_matrix(table, "common")), codes[0], codes[1], voxel_m
+        xyz, _unpacked(_matrix(table, "own")), _unpacked(_matrix(table, "common")), pair, frames, voxel_m
     )
     rows = np.flatnonzero(merged.n_pairs >= min_observations)
     corner = tile_corners(xyz[:1], tile_m)[0]

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
 
-from pipeline.engine.tables import explained
+from pipeline.engine.tables import dataset, explained
 from pipeline.geometry.arrays import Floats
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
 from pipeline.lidar.nearby import LocalTiles, returns_near
@@ -108,8 +107,7 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
     """
     ids = pa.array([item.frame_id for item in items])
     with explained(job.depths, "depths"):
-        dataset = ds.dataset(job.depths, format="parquet")
-        depths = dataset.to_table(columns=_COLUMNS, filter=ds.field("frame_id").isin(ids))
+        depths = dataset(job.depths).to_table(columns=_COLUMNS, filter=pc.field("frame_id").isin(ids))
     rows = align(depths, job.methods)
     centres = np.array([item.view.centre_in_enu_m for item in items])
     near = _Surroundings.of(returns_near(job.tiles, centres, job.max_range_m))
@@ -139,7 +137,7 @@ def frames_in(depths: Path) -> set[str]:
 def _distinct(depths: Path, column: str) -> set[str]:
     names: set[str] = set()
     with explained(depths, "depths"):
-        for batch in ds.dataset(depths, format="parquet").to_batches(columns=[column]):
+        for batch in dataset(depths).to_batches(columns=[column]):
             names.update(pc.unique(batch.column(column)).to_pylist())
     return names
 

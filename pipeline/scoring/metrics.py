@@ -35,7 +35,7 @@ class DepthSums:
             reference_m: (n,) reference depths, finite and > 0, m.
 
         Source: Eigen, Puhrsch, Fergus, "Depth map prediction from a single image using a multi-scale deep network"
-        (2014), section 4.1; the paper, section IV.
+        (2014), section 4.1; Aggarwal et al., "EpiTransfer", section IV.
         """
         error = depth_m - reference_m
         ratio = np.maximum(depth_m / reference_m, reference_m / depth_m)

@@ -96,7 +96,7 @@ def pose_sigmas(model: str, fix: Fix, height_datum: str) -> LoggedSigmas:
         if fix.rtk_flag == RTK_FIXED:
             own = (east, north, up)
     elif fix.sigma_horizontal_m is not None:
-        east = north = up = fix.sigma_horizontal_m
+        east = north = fix.sigma_horizontal_m
     if height_datum == TAKEOFF:
         up, own = kind.barometer_m, (own[0], own[1], kind.own_position_m[2])
     return LoggedSigmas(

@@ -167,6 +167,7 @@ def _decoded(data: bytes) -> tuple[int, int, bytes]:
                 # An eighth of the size still reads the file to its end, without holding all pixels.
                 image.draft("L", (max(1, width // 8), max(1, height // 8)))
                 image.load()
+                whole = image.format not in {"JPEG", "MPO"} or _ended(data)
     except Image.DecompressionBombError as error:
         raise dji.Unusable(
             f"more than {_MAX_PIXELS // 1_000_000} megapixels, not decoded: not an aerial photo"
@@ -175,7 +176,14 @@ def _decoded(data: bytes) -> tuple[int, int, bytes]:
         raise dji.Unusable("not an image, whatever its name says: leave it out") from error
     except _DAMAGED as error:
         raise dji.Unusable(f"damaged or truncated ({error}): copy it again from the card") from error
+    if not whole:
+        raise dji.Unusable("damaged or truncated (it ends in zeros): copy it again from the card")
     return width, height, packet
+
+
+def _ended(data: bytes) -> bool:
+    """Whether a JPEG does not break off into zeros, as an interrupted copy does: decoders take those for grey."""
+    return not data.endswith(bytes(64)) or data.rstrip(b"\0").endswith(b"\xff\xd9")
 
 
 def _packet(image: Image.Image) -> bytes:

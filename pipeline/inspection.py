@@ -9,12 +9,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import laspy
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.engine.errors import EpiTransferError, InputError
 from pipeline.lidar.tile_crs import tile_crs
+from pipeline.lidar.tiles import read_header
 from pipeline.sources import datums
 from pipeline.sources.accuracy import LoggedSigmas, pose_sigmas
 from pipeline.sources.files import IMAGE_SUFFIXES, MARK_SUFFIXES, find, is_url, opened
@@ -24,7 +24,6 @@ from pipeline.sources.photos import PhotoRecord, read_photo
 TILE_SUFFIXES = (".las", ".laz")
 TABLE_SUFFIXES = (".parquet",)
 _MANIFEST = "manifest.json"
-_UNREADABLE = (laspy.errors.LaspyException, OSError, ValueError, EOFError, IndexError, KeyError, TypeError)
 
 
 def describe(source: str) -> list[dict[str, Any]]:
@@ -147,11 +146,7 @@ def _marks(location: str) -> dict[str, Any]:
 
 def _tile(path: Path) -> dict[str, Any]:
     """A tile's header; its points are not read."""
-    try:
-        with laspy.open(path, read_evlrs=True) as reader:
-            header = reader.header
-    except _UNREADABLE as error:
-        raise InputError("E-INSPECT-02", "the LiDAR tile cannot be read", where=str(path), found=str(error)) from error
+    header = read_header(path)
     problem = ""
     try:
         crs = tile_crs(header, path).name
@@ -175,7 +170,13 @@ def _table(path: Path) -> dict[str, Any]:
         file = pq.ParquetFile(path, arrow_extensions_enabled=False)
         rows, schema = file.metadata.num_rows, file.schema_arrow
     except (pa.ArrowException, OSError) as error:
-        raise InputError("E-INSPECT-03", "the table cannot be read", where=str(path), found=str(error)) from error
+        raise InputError(
+            "E-INSPECT-03",
+            "the table cannot be read",
+            where=str(path),
+            found=str(error),
+            hint="is it a whole Parquet file?",
+        ) from error
     metadata = schema.metadata or {}
     return {
         "kind": "table",

@@ -53,7 +53,9 @@ def describe(source: str) -> list[dict[str, Any]]:
             "E-INSPECT-01",
             "nothing here that can be inspected",
             where=source,
+            found="a folder without any of these" if Path(source).is_dir() else Path(source).name,
             expected="photos, .mrk, .las/.laz, .parquet, or a run folder",
+            hint="logs, bags and subtitles cannot be read yet",
         )
     return out
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field, model_validator
 
 from pipeline.engine.errors import NothingLeftError
+from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geodesy.crs import output_crs
 from pipeline.geodesy.enu import LocalFrame
+from pipeline.geodesy.heights import ELLIPSOIDAL, is_orthometric
+from pipeline.geodesy.transform import CrsTransform
 from pipeline.geometry.cameras import PixelSigma
 from pipeline.points.geoparquet import TileFile, write_dataset
 from pipeline.points.observations import Scene, fused_tile, observations, spill
@@ -59,7 +63,26 @@ def run(config: Config, context: Context) -> str:
         )
     described = item(written, scene.transform.crs, "points", "Points by epipolar transfer, with covariance")
     (context.output("points") / "item.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
-    return f"{rows} points in {len(written)} tiles, {scene.transform.crs.name}"
+    return f"{rows} points in {counted(len(written), 'tile')}, {scene.transform.crs.name}"
+
+
+def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
+    """Refuses a CRS, a height datum or a geoid that the points could not be delivered with."""
+    del config
+    if facts["origin"] is not None:
+        _transform(setting, facts)
+
+
+def _transform(setting: Callable[[str], Any], facts: Mapping[str, Any]) -> CrsTransform:
+    source = facts["height_datum"]
+    return output_crs(
+        setting("ingest.crs"),
+        LocalFrame(**facts["origin"]),
+        # Ingest makes orthometric heights ellipsoidal.
+        ELLIPSOIDAL if is_orthometric(source) else source,
+        setting("ingest.geoid"),
+        source_datum=source,
+    )
 
 
 def _scene(context: Context) -> Scene:
@@ -67,14 +90,6 @@ def _scene(context: Context) -> Scene:
     facts = context.facts("ingest")
     usable = frames.filter(frames.column("usable"))
     ids = usable.column("frame_id").to_pylist()
-    origin = LocalFrame(**facts["origin"])
-    transform = output_crs(
-        context.setting("ingest.crs"),
-        origin,
-        usable.column("height_datum")[0].as_py(),
-        context.setting("ingest.geoid"),
-        source_datum=facts["height_datum"],
-    )
     images = usable.column("image").to_pylist()
     return Scene(
         {frame: f"{facts['photo_root']}/{image}" for frame, image in zip(ids, images, strict=True)},
@@ -82,7 +97,7 @@ def _scene(context: Context) -> Scene:
         camera_by_frame(frames, cameras_of(context.read("cameras"))),
         poses_of(context.read("poses")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
-        transform,
+        _transform(context.setting, facts),
         PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px")),
         context.setting("depth.methods")[0],
     )
@@ -108,4 +123,5 @@ STAGE = Stage(
     run,
     reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px", "match.max_image_px"),
     facts_of=("ingest",),
+    foresee=foresee,
 )

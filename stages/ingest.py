@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import Field, field_validator
 
 from pipeline.engine.errors import EpiTransferError
+from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.geodesy.heights import height_datum
 from pipeline.sources.calibration import read_calibration
@@ -89,9 +90,16 @@ def run(config: Config, context: Context) -> str:
     for text in [*unread, *(f"{name}: {why}" for name, why in sorted(found.exposures.problems.items()))]:
         context.warn(f"exposure marks not used: {text}")
     _warn_of_unusable(context, found, len(usable))
+    zoneless = [record.time_source for record in records].count("exif (zone unknown)")
+    if zoneless and not config.clock_offset_s:
+        context.warn(
+            f"{zoneless} photos do not say their time zone; their local time is read as UTC (state the difference: "
+            "--set ingest.clock_offset_s=-36000 for ten hours east)"
+        )
+    marked = len(found.exposures.of_photo)
     return (
-        f"{usable.count(True)} of {len(usable)} photos usable, {found.cameras.num_rows} cameras, "
-        f"heights {found.heights.stated}, {len(found.exposures.of_photo)} with RTK exposure marks"
+        f"{usable.count(True)} of {len(usable)} photos usable, {counted(found.cameras.num_rows, 'camera')}, heights "
+        f"{found.heights.stated}" + (f", {marked} with RTK exposure marks" if marked else "")
     )
 
 

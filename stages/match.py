@@ -12,6 +12,7 @@ import pyarrow as pa
 from pydantic import Field
 
 from pipeline.engine.errors import NothingLeftError
+from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import dataset
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, poses_of, selected_pairs
@@ -84,7 +85,9 @@ def run(config: Config, context: Context) -> str:
             expected="matches within the epipolar band of the logged poses",
             hint="wrong gimbal angles or camera? compare `epitransfer inspect`; widen: --set match.band_sigmas=10",
         )
-    return f"{inliers} inliers of {found} matches in {len(pairs)} pairs" + (f", {empty} pairs without" if empty else "")
+    return f"{inliers} inliers of {found} matches in {counted(len(pairs), 'pair')}" + (
+        f", {empty} without any" if empty else ""
+    )
 
 
 def _images(context: Context) -> dict[str, _Image]:

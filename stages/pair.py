@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from pydantic import Field, model_validator
 
 from pipeline.engine.errors import NothingLeftError
+from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.flight import cameras_of, column, poses_of
 from pipeline.pairing.select import Candidates, Frames, PairRules, select_pairs
@@ -65,7 +66,10 @@ def run(config: Config, context: Context) -> str:
     if not selected:
         raise _nothing(table, usable.num_rows, config)
     context.write("pairs", table)
-    return f"{selected} pairs of {usable.num_rows} frames ({table.num_rows - selected} near the limits rejected)"
+    return (
+        f"{counted(selected, 'pair')} of {counted(usable.num_rows, 'frame')} "
+        f"({table.num_rows - selected} more candidates rejected, with reasons)"
+    )
 
 
 def _flight(usable: pa.Table, context: Context, config: Config) -> Frames:
@@ -113,16 +117,17 @@ def _table(found: Candidates, ids: Any) -> pa.Table:
 
 def _nothing(table: pa.Table, n_frames: int, config: Config) -> NothingLeftError:
     rules = [reason.split(" ")[0] for reason in table.column("reason").to_pylist()]
-    counted = ", ".join(f"{rules.count(rule)} by {rule}" for rule in sorted(set(rules)))
+    rejected = ", ".join(f"{rules.count(rule)} by {rule}" for rule in sorted(set(rules)))
     baseline = f"{config.baseline_m[0]:g} .. {config.baseline_m[1]:g} m"
     return NothingLeftError(
         "E-PAIR-01",
         "no pair of frames can give depth",
         found=f"{n_frames} usable frames; near the limits {table.num_rows} candidates rejected"
-        + (f": {counted}" if counted else ""),
+        + (f": {rejected}" if rejected else ""),
         expected=f"two frames {baseline} apart that see the same ground, epipole outside the region of interest",
-        hint="a hover or a single photo has no baseline; otherwise see --set pair.baseline_m='[1, 40]', pair.roi, "
-        "pair.epipole_margin_px, and `epitransfer inspect` for frames that are not usable",
+        hint="the reasons of unusable photos are in frames.problem; see `epitransfer inspect`"
+        if n_frames < 2
+        else "a hover has no baseline; otherwise see --set pair.baseline_m='[1, 40]', pair.roi, pair.epipole_margin_px",
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
+from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses_of, relative_pose_row, selected_pairs
@@ -44,10 +45,16 @@ def run(config: Config, context: Context) -> str:
     context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
     usable = frames.filter(frames.column("usable"))
     context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
-    medians = [float(str(row["median_before_px"])) for row in rows if row["median_before_px"] is not None]
-    typical = f"{np.median(medians):.2f} px" if medians else "unknown"
-    context.record("median_epipolar_residual_px", round(float(np.median(medians)), 4) if medians else None)
-    return f"{len(rows)} pairs, median epipolar residual under the logged poses {typical}"
+    residuals = {str(row["pair_id"]): row["median_before_px"] for row in rows}
+    known = {pair_id: float(str(value)) for pair_id, value in residuals.items() if value is not None}
+    if not known:
+        return f"{counted(len(rows), 'pair')}, none with a match that agrees with its pose"
+    middle, worst = float(np.median(list(known.values()))), max(known, key=lambda pair_id: known[pair_id])
+    context.record("median_epipolar_residual_px", round(middle, 4))
+    return (
+        f"{counted(len(rows), 'pair')}, median epipolar residual under the logged poses {middle:.2f} px, "
+        f"worst {known[worst]:.1f} px ({worst})"
+    )
 
 
 def by_pair(matches: pa.Table) -> dict[str, pa.Table]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -84,16 +84,28 @@ def _tiles(config: Config, context: Context) -> LocalTiles:
     """The tiles' headers, and the frame they are brought into."""
     frames = context.read("frames")
     datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
+    _check_datums(datums)
+    origin = context.facts("ingest")["origin"]
+    frame = LocalFrame(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
+    tiles = tuple(read_tile(path, config.lidar_height_datum) for path in expand(config.lidar))
+    return LocalTiles(tiles, frame, context.setting("ingest.geoid"), datums[0])
+
+
+def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
+    """Refuses heights that cannot meet LiDAR's, and tiles that cannot be read or do not say their heights."""
+    del setting
+    _check_datums([facts["height_datum"]])
+    for path in expand(config.lidar):
+        read_tile(path, config.lidar_height_datum)
+
+
+def _check_datums(datums: Sequence[str]) -> None:
     if len(datums) != 1 or datums[0] in (*RELATIVE, UNKNOWN):
         raise UndeterminedError(
             "E-SCORE-02", "the flight's heights cannot be brought to those of LiDAR", where="frames, height_datum",
             found=", ".join(datums) or "no usable frame", expected="one datum that a geoid ties to the ellipsoid",
             hint="say what the source's heights are: --set ingest.height_datum=ellipsoidal (or egm96, egm2008, navd88)",
         )  # fmt: skip
-    origin = context.facts("ingest")["origin"]
-    frame = LocalFrame(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
-    tiles = tuple(read_tile(path, config.lidar_height_datum) for path in expand(config.lidar))
-    return LocalTiles(tiles, frame, context.setting("ingest.geoid"), datums[0])
 
 
 def _views(context: Context, wanted: set[str]) -> list[FrameView]:
@@ -171,4 +183,5 @@ STAGE = Stage(
     reads=("ingest.geoid", "depth.methods"),
     facts_of=("ingest",),
     sources=sources,
+    foresee=foresee,
 )

@@ -9,9 +9,7 @@ from typing import Annotated
 import typer
 
 from pipeline.engine.runfolder import RunFolder
-from pipeline.engine.runner import staleness
-from stages.registry import STAGES
-from stages.workflow import kept_configuration
+from stages.workflow import kept_configuration, states
 
 
 def command(
@@ -21,18 +19,14 @@ def command(
     """Compares each stage's inputs and configuration with what its outputs were made from."""
     folder = RunFolder(run)
     configuration = kept_configuration(folder)
-    rows: dict[str, dict[str, str]] = {}
-    waits_for = ""
-    for name, stage in STAGES.items():
-        if name not in configuration.sections:
-            continue
-        state = staleness(stage, folder, configuration)
-        status, because = state.status, state.because
-        if status == "fresh" and waits_for:
-            status, because = "stale", f"{waits_for} has to run first"
-        if status != "fresh" and not waits_for:
-            waits_for = name
-        rows[name] = {"status": status, "because": because, "summary": (folder.record(name) or {}).get("summary", "")}
+    rows = {
+        name: {
+            "status": state.status,
+            "because": state.because,
+            "summary": (folder.record(name) or {}).get("summary", ""),
+        }
+        for name, state in states(folder, configuration).items()
+    }
     if as_json:
         typer.echo(json.dumps({"run": str(folder.root), "stages": rows}))
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pipeline.engine.config import Configuration, Sections, load_workflow, resolve, to_toml
@@ -10,7 +11,7 @@ from pipeline.engine.errors import TooManyFailuresError, UsageError
 from pipeline.engine.executors import executor_for
 from pipeline.engine.progress import Reporter
 from pipeline.engine.runfolder import RunFolder, write_text
-from pipeline.engine.runner import run_stage, staleness
+from pipeline.engine.runner import State, run_stage, staleness
 from stages.registry import MODELS, STAGES
 
 
@@ -37,6 +38,22 @@ def kept_configuration(folder: RunFolder) -> Configuration:
     return resolve([("run folder", kept_sections(folder))], MODELS)
 
 
+def states(folder: RunFolder, configuration: Configuration) -> dict[str, State]:
+    """The state of every stage the configuration has a section for; what follows a stale stage is stale."""
+    found: dict[str, State] = {}
+    waits_for = ""
+    for name, stage in STAGES.items():
+        if name not in configuration.sections:
+            continue
+        state = staleness(stage, folder, configuration)
+        if state.status == "fresh" and waits_for:
+            state = replace(state, status="stale", because=f"{waits_for} has to run first")
+        if state.status != "fresh" and not waits_for:
+            waits_for = name
+        found[name] = state
+    return found
+
+
 def chosen_stages(configuration: Configuration, first: str | None, last: str | None) -> list[str]:
     """The stages a workflow has sections for, between two of them.
 
@@ -54,6 +71,13 @@ def chosen_stages(configuration: Configuration, first: str | None, last: str | N
             )
     begin = names.index(first) if first else 0
     end = names.index(last) + 1 if last else len(names)
+    if begin >= end:
+        raise UsageError(
+            "E-RUN-11",
+            f"--from {first} comes after --to {last}",
+            expected=", ".join(names),
+            hint=f"--from {last} --to {first}",
+        )
     return names[begin:end]
 
 
@@ -96,8 +120,15 @@ def execute(
                 record = run_stage(stage, folder, configuration, executor, reporter)
                 reporter.say(f"{name:<7}{record['summary']} ({record['seconds']:.1f} s)")
             records[name] = record
+            if name == "ingest":
+                _foresee(configuration, names, record["facts"])
     _check_failures(records, configuration)
     return records
+
+
+def _foresee(configuration: Configuration, names: Sequence[str], facts: Mapping[str, Any]) -> None:
+    for name in names:
+        STAGES[name].foresee(configuration.sections[name], configuration.value, facts)
 
 
 def _check_failures(records: Mapping[str, Any], configuration: Configuration) -> None:

@@ -85,6 +85,11 @@ class Context(Protocol):
         """A folder for content-addressed files that later runs may reuse."""
 
 
+def nothing_to_foresee(config: Any, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
+    """For stages whose refusals depend on the tables they read."""
+    del config, setting, facts
+
+
 def no_sources(config: Any) -> Sequence[Path]:
     """For stages that read nothing from outside the run folder."""
     del config
@@ -105,6 +110,8 @@ class Stage:
         reads: Keys of other stages' configuration it reads, "ingest.geoid".
         facts_of: Stages whose recorded facts it reads; those facts are part of its staleness key.
         sources: Files from outside the run folder that it reads; their bytes are part of its staleness key.
+        foresee: Raises what the stage would refuse anyway, from configuration and the facts of ingest alone, so that a
+            run is refused before the long stages and not after them.
         place: The fact that tells where the sources lie, and how it follows from the configuration. The stage runs
             again when they moved, to tell it anew; later stages do not, for what they were made from is the same.
     """
@@ -118,4 +125,5 @@ class Stage:
     reads: tuple[str, ...] = ()
     facts_of: tuple[str, ...] = ()
     sources: Callable[[Any], Sequence[Path | str]] = field(default=no_sources)
+    foresee: Callable[[Any, Callable[[str], Any], Mapping[str, Any]], None] = field(default=nothing_to_foresee)
     place: tuple[str, Callable[[Any], str]] | None = None

@@ -46,7 +46,7 @@ def tile_crs(header: laspy.LasHeader, path: Path, height_datum: str | None = Non
             "E-LIDAR-03", "the tile does not name its CRS", where=str(path),
             found="no WKT record and no GeoTIFF keys with a known code",
             expected="a compound CRS, such as EPSG:32617+5703",
-            hint=f"tag it: pdal translate {path.name} tagged.laz --writers.las.a_srs=EPSG:32617+5703",
+            hint=_tag_hint(path),
         )  # fmt: skip
     if has_heights(crs):
         return crs
@@ -54,10 +54,17 @@ def tile_crs(header: laspy.LasHeader, path: Path, height_datum: str | None = Non
         raise UndeterminedError(
             "E-LIDAR-04", "the tile's CRS does not say what its heights are measured from", where=str(path),
             found=f"{crs.name}, two-dimensional", expected="a compound CRS, such as EPSG:32617+5703",
-            hint="state it for such tiles: --set score.lidar_height_datum=EPSG:5703 (or ellipsoidal, egm96, egm2008, "
-            f"navd88), or tag the tile: pdal translate {path.name} tagged.laz --writers.las.a_srs=EPSG:32617+5703",
+            hint="state it for such tiles: --set score.lidar_height_datum=... (ellipsoidal, egm96, egm2008, navd88, or "
+            f"the EPSG code of their vertical CRS), or {_tag_hint(path, crs)}",
         )  # fmt: skip
     return _with_stated_heights(crs, height_datum, path)
+
+
+def _tag_hint(path: Path, crs: pyproj.CRS | None = None) -> str:
+    """How to tag a tile; its own horizontal CRS is named where it is known, the rest only its owner knows."""
+    code = crs.to_epsg() if crs is not None else None
+    horizontal = f"EPSG:{code}" if code is not None else "EPSG:HORIZONTAL"
+    return f"tag it: pdal translate {path.name} tagged.laz --writers.las.a_srs={horizontal}+VERTICAL (its EPSG codes)"
 
 
 def has_heights(crs: pyproj.CRS) -> bool:
@@ -141,7 +148,7 @@ def _parsed(text: str, path: Path) -> pyproj.CRS:
 def _not_understood(path: Path, text: str, error: CRSError) -> UndeterminedError:
     return UndeterminedError(
         "E-LIDAR-06", "the tile's CRS is not understood", where=str(path), found=f"{text[:120]} ({str(error)[:200]})",
-        hint=f"tag it: pdal translate {path.name} tagged.laz --writers.las.a_srs=EPSG:32617+5703",
+        hint=_tag_hint(path),
     )  # fmt: skip
 
 

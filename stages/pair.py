@@ -122,10 +122,10 @@ def _nothing(table: pa.Table, n_frames: int, config: Config) -> NothingLeftError
     return NothingLeftError(
         "E-PAIR-01",
         "no pair of frames can give depth",
-        found=f"{n_frames} usable frames; near the limits {table.num_rows} candidates rejected"
+        found=f"{counted(n_frames, 'usable frame')}; near the limits {table.num_rows} candidates rejected"
         + (f": {rejected}" if rejected else ""),
         expected=f"two frames {baseline} apart that see the same ground, epipole outside the region of interest",
-        hint="the reasons of unusable photos are in frames.problem; see `epitransfer inspect`"
+        hint="a single photo has no baseline; why others are not usable stands in frames.problem, and `inspect` tells"
         if n_frames < 2
         else "a hover has no baseline; otherwise see --set pair.baseline_m='[1, 40]', pair.roi, pair.epipole_margin_px",
     )

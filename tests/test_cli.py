@@ -377,6 +377,17 @@ def test_a_scheduler_that_does_not_answer(
     assert "tcp://127.0.0.1:1" in err
 
 
+def test_what_the_data_do_not_say_the_user_must(
+    small_flight: Path, small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = copied(small_run, tmp_path / "run")
+    assert spoken(capsys, "ingest", run, "--set", "ingest.height_datum=unknown")[0] == 0
+    code, out, err = spoken(capsys, "score", run, "--jobs", "1")
+    assert (code, out) == (4, "")
+    assert "E-SCORE-02" in err
+    assert "--set ingest.height_datum=" in err
+
+
 def test_too_many_failures_are_told_after_the_work_is_done(
     small_flight: Path, small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

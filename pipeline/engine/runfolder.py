@@ -126,6 +126,7 @@ class RunFolder:
         """Finishes the commits a killed run had begun."""
         for pending in sorted((self.root / ".pending").glob("*")):
             self._roll_forward(pending)
+        self.write_manifest()
 
     def _roll_forward(self, pending: Path) -> None:
         stage = pending.name
@@ -147,11 +148,12 @@ class RunFolder:
         self.write_manifest()
 
     def write_manifest(self) -> None:
-        """Gathers the records into manifest.json."""
+        """Gathers the records into manifest.json, where they are not there already."""
         found = {path.stem: self.record(path.stem) for path in sorted((self.root / ".stages").glob("*.json"))}
         records = {stage: record for stage, record in found.items() if record is not None}
-        ordered = dict(sorted(records.items(), key=lambda item: (item[1].get("position", 0), item[0])))
-        write_json(self.root / "manifest.json", {"schema": 1, "stages": ordered})
+        path, text = self.root / "manifest.json", json_text({"schema": 1, "stages": records})
+        if records and not (path.exists() and path.read_bytes() == text.encode()):
+            write_text(path, text)
 
 
 def output_name(name: str) -> str:
@@ -169,7 +171,12 @@ def tree_size(path: Path) -> int:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON atomically."""
-    write_text(path, json.dumps(value, indent=1, sort_keys=False, default=str) + "\n")
+    write_text(path, json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """JSON as it is written into a run folder."""
+    return json.dumps(value, indent=1, sort_keys=False, default=str) + "\n"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -26,7 +26,7 @@ from pipeline.scoring.metrics import DELTA_BASE
 # Nothing farther is scored, and an unmasked depth is clipped to this.
 MAX_RANGE_M, LEAST_M = 100.0, 0.1
 NAMES = {
-    "epitransfer-lateral": "lateral (EpiTransfer's)",
+    "epitransfer-lateral": "lateral",
     "epitransfer-vertical": "vertical",
     "epitransfer": "adaptive",
     "dlt": "DLT",

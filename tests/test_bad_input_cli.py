@@ -59,10 +59,14 @@ def frames_of(run: Path) -> dict[str, dict[str, object]]:
 # --- photos ---
 
 
+def write_bad(folder: Path, prefix: str = "") -> None:
+    for name, (write, _) in BAD.items():
+        write(folder / f"{prefix}{name}.JPG")  # type: ignore[no-untyped-call]
+
+
 def add_bad_photos(photos: Path) -> list[str]:
     """One of each kind, the damaged ones made from a whole photo of the flight."""
-    for name, (write, _) in BAD.items():
-        write(photos / f"BAD_{name}.JPG")
+    write_bad(photos, "BAD_")
     whole = (photos / "DJI_0001.JPG").read_bytes()
     (photos / "BAD_cut.JPG").write_bytes(whole[: len(whole) // 2])
     (photos / "BAD_zeroed.JPG").write_bytes(whole[: len(whole) // 3] + b"\0" * (len(whole) - len(whole) // 3))
@@ -93,8 +97,7 @@ def test_bad_photos_are_rows_and_the_good_ones_go_on(
 
 def test_only_bad_photos(tmp_path: Path, spoken: Callable[..., Spoken]) -> None:
     (tmp_path / "photos").mkdir()
-    for name, (write, _) in BAD.items():
-        write(tmp_path / "photos" / f"{name}.JPG")
+    write_bad(tmp_path / "photos")
     code, _, err = spoken(*run_of(tmp_path / "photos", tmp_path / "run"))
     assert code == 5
     assert "0 usable frames" in err

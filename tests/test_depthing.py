@@ -88,8 +88,8 @@ def test_a_lateral_view_on_a_sideways_pair_masks_everything() -> None:
     """All three centres lie on one line: no view along it adds a plane."""
     rng = np.random.default_rng(1)
     ref_px, src_px, _ = seen(SIDEWAYS, (PLAIN, PLAIN))
-    noisy = (px + rng.normal(0.0, 0.5, px.shape) for px in (ref_px, src_px))
-    rays = MatchedRays.of(*noisy, PLAIN, PLAIN, SIGMA)
+    noisy_ref, noisy_src = (px + rng.normal(0.0, 0.5, px.shape) for px in (ref_px, src_px))
+    rays = MatchedRays.of(noisy_ref, noisy_src, PLAIN, PLAIN, SIGMA)
     for lateral in (
         found_by("epitransfer-lateral", SIDEWAYS, rays),
         found_by("epitransfer", SIDEWAYS, rays, VirtualView.LATERAL),
@@ -201,8 +201,12 @@ def test_predicted_sigma_is_that_of_redrawn_pixels() -> None:
     exact = replace(FORWARD, covariance=np.zeros((6, 6)))
     drawn = []
     for _ in range(300):
-        noisy = (px + rng.normal(0.0, SIGMA.of(c), px.shape) for px, c in ((ref_px, LENS), (src_px, WIDE)))
-        drawn.append(found_by("epitransfer", exact, MatchedRays.of(*noisy, LENS, WIDE, SIGMA)).depths.depth_m)
+        noisy_ref, noisy_src = (
+            px + rng.normal(0.0, SIGMA.of(c), px.shape) for px, c in ((ref_px, LENS), (src_px, WIDE))
+        )
+        drawn.append(
+            found_by("epitransfer", exact, MatchedRays.of(noisy_ref, noisy_src, LENS, WIDE, SIGMA)).depths.depth_m
+        )
     predicted = found_by("epitransfer", exact, MatchedRays.of(ref_px, src_px, LENS, WIDE, SIGMA)).depths
     linear = predicted.variance_m2 < (0.1 * depth) ** 2
     assert linear.mean() > 0.5

@@ -239,7 +239,8 @@ def brute_matches(
 
 def random_rays(rng: np.random.Generator, n: int) -> Floats:
     rays = rng.normal(size=(n, 3))
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    out: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return out
 
 
 @settings(max_examples=60, deadline=None)

@@ -57,7 +57,8 @@ def ground_mask(camera: Camera, rotation: Floats, up: float, range_m: float, pix
     rays = camera.rays(pixels) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = up * np.linalg.norm(rays, axis=1) / -rays[:, 2]
-    return (rays[:, 2] < 0.0) & (distance <= range_m)
+    out: Bools = (rays[:, 2] < 0.0) & (distance <= range_m)
+    return out
 
 
 # --- epipole ---

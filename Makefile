@@ -6,11 +6,12 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= runs/$(notdir $(basename $(WORKFLOW)))
 
-.PHONY: help example run test lint bench pictures clean
+.PHONY: help example run test fuzz lint bench pictures clean
 help:
 	@echo "make example                 the built-in flight, from photos to scored points, in runs/example"
 	@echo "make run WORKFLOW=file.toml  a flight of yours, in runs/NAME (OUT=folder to choose)"
 	@echo "make test | lint | bench     the tests, the checks of the code, the timings as ratios"
+	@echo "make fuzz                    10,000 damaged copies of a real file for every reader"
 	@echo "make pictures                the pictures of the README, from runs/example"
 	@echo "make clean                   removes runs/, example/ and .venv"
 
@@ -39,6 +40,9 @@ endif
 
 test: $(READY)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+fuzz: $(READY)
+	EPITRANSFER_FUZZ=10000 $(BIN)/python -m pytest -n $(JOBS) -k fuzz
 
 lint: $(READY)
 	$(BIN)/ruff check .

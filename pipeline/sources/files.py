@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import glob
+import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -216,3 +218,29 @@ def _missing(name: str) -> list[str]:
     raise InputError(
         "E-FILE-01", "a source is missing", where=name, found="no such file or folder", hint="check the URL"
     )
+
+
+@contextmanager
+def local_copy(location: str) -> Iterator[Path]:
+    """A source as a file of this machine, for libraries that map or seek: itself, or a copy that is gone afterwards.
+
+    Args:
+        location: Path or URL.
+
+    Raises:
+        InputError: It is not there, or not a file.
+        ResourceError: Permission is missing, the disk is full, or the machine or network fails.
+    """
+    if not is_url(location):
+        try:
+            with Path(location).open("rb"):
+                pass
+        except OSError as error:
+            raise explained(location, error) from error
+        yield Path(location)
+        return
+    with tempfile.TemporaryDirectory(prefix="epitransfer.") as folder:
+        copy = Path(folder) / PurePosixPath(location).name
+        with opened(location) as stream, copy.open("wb") as target:
+            shutil.copyfileobj(stream, target, 1 << 20)
+        yield copy

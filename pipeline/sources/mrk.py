@@ -5,23 +5,11 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 
+from pipeline.clocks.gps import utc_from_gps
 from pipeline.engine.errors import InputError
 
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-# The first instant of each GPS - UTC difference since 2005, seconds (IERS Bulletin C 30, 36, 43, 49, 52).
-LEAP_SECONDS = (
-    (datetime(2017, 1, 1, tzinfo=UTC), 18),
-    (datetime(2015, 7, 1, tzinfo=UTC), 17),
-    (datetime(2012, 7, 1, tzinfo=UTC), 16),
-    (datetime(2009, 1, 1, tzinfo=UTC), 15),
-    (datetime(2006, 1, 1, tzinfo=UTC), 14),
-)
-_WEEK_S = 604_800.0
-_ROLL_OVER_WEEKS = 1024
-# No drone wrote marks before this; an earlier week has lost a roll-over of the 10-bit week number.
-_EARLIEST = datetime(2010, 1, 1, tzinfo=UTC)
 _MAX_BYTES = 64 << 20
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _LABELLED = re.compile(rf"({_NUMBER})\s*,\s*([A-Za-z]+)\b")
@@ -54,37 +42,6 @@ class Mark:
     sigma_east_m: float
     sigma_up_m: float
     quality: int
-
-
-def utc_from_gps(week: int, tow_s: float) -> datetime:
-    """UTC of a GPS week and time of week; a week that lost roll-overs of 1024 weeks gets them back.
-
-    Args:
-        week: GPS week, since 1980-01-06.
-        tow_s: Seconds of the week.
-
-    Returns:
-        UTC to the microsecond.
-
-    Raises:
-        ValueError: Not a time of week, or past the year 9999.
-    """
-    if not 0.0 <= tow_s < _WEEK_S + 1.0:
-        raise ValueError(f"{tow_s} is not a time of week")
-    if not 0 <= week < 400_000:
-        raise ValueError(f"{week} is not a GPS week")
-    gps = GPS_EPOCH + timedelta(weeks=week, seconds=tow_s)
-    while gps < _EARLIEST:
-        gps += timedelta(weeks=_ROLL_OVER_WEEKS)
-    return gps - timedelta(seconds=leap_seconds(gps))
-
-
-def leap_seconds(gps: datetime) -> int:
-    """GPS minus UTC at a moment of GPS time, whole seconds."""
-    for since, seconds in LEAP_SECONDS:
-        if gps >= since + timedelta(seconds=seconds):
-            return seconds
-    raise ValueError(f"{gps:%Y-%m-%d} is before the table of leap seconds")
 
 
 def read_marks(data: bytes, where: str = "") -> list[Mark]:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.clocks.gps import leap_seconds, utc_from_gps
 from pipeline.engine.errors import InputError
 from pipeline.sources import dji
 from pipeline.sources.exposures import MarkFile, apply, associate, running_number
-from pipeline.clocks.gps import leap_seconds, utc_from_gps
 from pipeline.sources.mrk import Mark, read_marks
 from pipeline.sources.photos import PhotoRecord
 

@@ -15,10 +15,11 @@ from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
-from pipeline.geodesy.crs import output_crs
+from pipeline.geodesy.crs import local_output, output_crs
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, is_orthometric
-from pipeline.geodesy.transform import CrsTransform
+from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
+from pipeline.geodesy.transform import FrameTransform
 from pipeline.geometry.cameras import PixelSigma
 from pipeline.points.geoparquet import TileFile, write_dataset
 from pipeline.points.observations import Scene, fused_tile, observations, spill
@@ -69,11 +70,14 @@ def run(config: Config, context: Context) -> str:
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
     """Refuses a CRS, a height datum or a geoid that the points could not be delivered with."""
     del config
-    if facts["origin"] is not None:
+    # On earth there is no origin when no frame is usable, and then nothing to deliver.
+    if facts["origin"] is not None or facts.get("world", EARTH) == LOCAL_WORLD:
         _transform(setting, facts)
 
 
-def _transform(setting: Callable[[str], Any], facts: Mapping[str, Any]) -> CrsTransform:
+def _transform(setting: Callable[[str], Any], facts: Mapping[str, Any]) -> FrameTransform:
+    if facts.get("world", EARTH) == LOCAL_WORLD:
+        return local_output(setting("ingest.crs"))
     source = facts["height_datum"]
     return output_crs(
         setting("ingest.crs"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,16 +13,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field
 
-from pipeline.engine.errors import NothingLeftError, UndeterminedError
+from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.flight import camera_by_frame, cameras_of, poses_of
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.heights import RELATIVE, UNKNOWN
-from pipeline.geometry.arrays import Floats
+from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.lidar.nearby import LocalTiles
-from pipeline.lidar.tiles import expand, read_tile
+from pipeline.lidar.tiles import expand, read_local_tile, read_tile
 from pipeline.lidar.visibility import View
 from pipeline.scoring.frame_scores import FrameScore, FrameView, ScoringJob, frames_in, methods_of, score_frames
+from pipeline.scoring.refusals import apart, check_datums, no_reference, nothing_to_score_against
 from pipeline.scoring.summary import metrics_object, sentence, to_json
 from schemas import SCORES
 
@@ -31,8 +32,10 @@ _FRAMES_PER_SHARD = 8
 class Config(StageConfig):
     """The truth and how far it is believed."""
 
-    lidar: str | tuple[str, ...] = Field(
-        description="LAS, LAZ or COPC tiles: a file, a folder, a glob, or a list of these",
+    lidar: str | tuple[str, ...] | None = Field(
+        None,
+        description="LAS, LAZ or COPC tiles: a file, a folder, a glob, or a list of these; left out, the run's own "
+        "LiDAR sweeps",
         json_schema_extra={"path": True},
     )
     lidar_height_datum: str | None = Field(
@@ -48,15 +51,16 @@ def run(config: Config, context: Context) -> str:
     """Scores `depths` against the tiles; writes `scores/metrics.json` and `scores/pixels.parquet`."""
     depths, folder = context.path("depths"), context.output("scores")
     tiles = _tiles(config, context)
+    context.record("lidar", "the run's own sweeps" if config.lidar is None else "tiles named")
     views = _views(context, frames_in(depths))
     if not views:
         raise NothingLeftError("E-SCORE-05", "no depth to score", where=str(depths), hint="see what depth masked")
     centres = np.array([item.view.centre_in_enu_m for item in views])
     meeting = tiles.meeting(centres, config.max_range_m)
     if not meeting:
-        raise _apart(tiles, centres, config.max_range_m)
+        raise apart(tiles, centres, config.max_range_m)
     job = ScoringJob(
-        LocalTiles(meeting, tiles.frame, tiles.geoid, tiles.height_datum),
+        replace(tiles, tiles=meeting),
         depths,
         methods_of(depths, context.setting("depth.methods")[0]),
         config.max_range_m,
@@ -70,7 +74,12 @@ def run(config: Config, context: Context) -> str:
     metrics = metrics_object(job.methods, scores)
     _tell(context, scores, tiles, meeting)
     if not any(score.methods[0].n_scored for score in scores):
-        raise _no_reference(scores, config.max_range_m)
+        raise no_reference(
+            sum(score.n_matches for score in scores),
+            sum(score.n_visible for score in scores),
+            tiles,
+            config.max_range_m,
+        )
     (folder / "metrics.json").write_text(to_json(metrics), encoding="utf-8")
     return sentence(metrics)
 
@@ -82,30 +91,43 @@ def _checked(table: pa.Table) -> pa.Table:
 
 def _tiles(config: Config, context: Context) -> LocalTiles:
     """The tiles' headers, and the frame they are brought into."""
+    facts = context.facts("ingest")
+    if config.lidar is None:
+        return LocalTiles(tuple(map(read_local_tile, _sweeps(context.path("sweeps")))))
+    if _is_local(facts):
+        return LocalTiles(tuple(map(read_local_tile, expand(config.lidar))))
     frames = context.read("frames")
     datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
-    _check_datums(datums)
-    origin = context.facts("ingest")["origin"]
+    check_datums(datums)
+    origin = facts["origin"]
     frame = LocalFrame(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
     tiles = tuple(read_tile(path, config.lidar_height_datum) for path in expand(config.lidar))
     return LocalTiles(tiles, frame, context.setting("ingest.geoid"), datums[0])
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
-    """Refuses heights that cannot meet LiDAR's, and tiles that cannot be read or do not say their heights."""
+    """Refuses heights that cannot meet LiDAR's, tiles that cannot be read or placed, and having no reference at all."""
     del setting
-    _check_datums([facts["height_datum"]])
+    if config.lidar is None:
+        if not facts.get("sweep_returns"):
+            raise nothing_to_score_against()
+        return
+    if not _is_local(facts):
+        check_datums([facts["height_datum"]])
     for path in expand(config.lidar):
-        read_tile(path, config.lidar_height_datum)
+        read_local_tile(path) if _is_local(facts) else read_tile(path, config.lidar_height_datum)
 
 
-def _check_datums(datums: Sequence[str]) -> None:
-    if len(datums) != 1 or datums[0] in (*RELATIVE, UNKNOWN):
-        raise UndeterminedError(
-            "E-SCORE-02", "the flight's heights cannot be brought to those of LiDAR", where="frames, height_datum",
-            found=", ".join(datums) or "no usable frame", expected="one datum that a geoid ties to the ellipsoid",
-            hint="say what the source's heights are: --set ingest.height_datum=ellipsoidal (or egm96, egm2008, navd88)",
-        )  # fmt: skip
+def _is_local(facts: Mapping[str, Any]) -> bool:
+    return bool(facts.get("world", EARTH) == LOCAL_WORLD)
+
+
+def _sweeps(folder: Path) -> tuple[Path, ...]:
+    """The tiles of the run's own sweeps, which are in the run's frame."""
+    tiles = tuple(sorted(folder.glob("*.laz")))
+    if not tiles:
+        raise nothing_to_score_against()
+    return tiles
 
 
 def _views(context: Context, wanted: set[str]) -> list[FrameView]:
@@ -132,52 +154,16 @@ def _tell(context: Context, scores: Sequence[FrameScore], tiles: LocalTiles, mee
         context.warn(f"{len(blind)} of {len(scores)} frames see no LiDAR return, {blind[0]} among them")
 
 
-def _apart(tiles: LocalTiles, centres: Floats, max_range_m: float) -> NothingLeftError:
-    reach = np.array([[-max_range_m] * 3, [max_range_m] * 3])
-    flight = np.stack([centres.min(axis=0), centres.max(axis=0)]) + reach
-    boxes = [
-        tiles.transform(tile).enu_from(np.array([tile.minimum, tile.maximum]))
-        for tile in tiles.tiles
-        if tile.point_count
-    ]
-    corners = np.concatenate(boxes) if boxes else np.zeros((0, 3))
-    lidar = _box(tiles.frame, corners) if len(corners) else "no returns"
-    return NothingLeftError(
-        "E-SCORE-03", "the LiDAR tiles and the flight do not overlap", where=str(tiles.tiles[0].path),
-        found=f"LiDAR {lidar}", expected=f"within {max_range_m:g} m of the cameras: {_box(tiles.frame, flight)}",
-        hint="name the tiles under the flight (score.lidar), and see that their CRS is right",
-    )  # fmt: skip
-
-
-def _box(frame: LocalFrame, corners_in_enu_m: Floats) -> str:
-    latitude, longitude, _ = frame.geodetic_from_enu(corners_in_enu_m)
-    return (
-        f"latitude {np.min(latitude):.5f} .. {np.max(latitude):.5f}, "
-        f"longitude {np.min(longitude):.5f} .. {np.max(longitude):.5f}"
-    )
-
-
-def _no_reference(scores: Sequence[FrameScore], max_range_m: float) -> NothingLeftError:
-    seen, matches = sum(score.n_visible for score in scores), sum(score.n_matches for score in scores)
-    return NothingLeftError(
-        "E-SCORE-04", "no match has a reference depth",
-        found=f"{matches:,} matches; the frames see {seen:,} LiDAR returns within {max_range_m:g} m",
-        expected="returns on the surfaces that are matched",
-        hint="see that heights and positions of LiDAR and flight are of one datum (ingest.height_datum, ingest.geoid), "
-        "or raise score.max_range_m",
-    )  # fmt: skip
-
-
 def sources(config: Config) -> tuple[Path, ...]:
-    """The tiles, whose bytes are part of the stage's staleness key."""
-    return expand(config.lidar)
+    """The tiles, whose bytes are part of the stage's staleness key; the run's own sweeps are an input like others."""
+    return () if config.lidar is None else expand(config.lidar)
 
 
 STAGE = Stage(
     "score",
     1,
     Config,
-    ("frames", "cameras", "poses", "depths"),
+    ("frames", "cameras", "poses", "depths", "sweeps"),
     ("scores",),
     run,
     reads=("ingest.geoid", "depth.methods"),

@@ -10,6 +10,7 @@ from pyproj.crs import CompoundCRS
 from pipeline.engine.errors import InputError, UndeterminedError, UsageError
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF, VERTICAL_EPSG
+from pipeline.geodesy.local_world import LocalTransform
 from pipeline.geodesy.transform import CrsTransform, read_crs
 
 # Vertical CRSs of no register, as WKT 2 (ISO 19162:2019, 10): zero is where the drone took off, or where the user says.
@@ -49,6 +50,30 @@ def output_crs(
     if len(chosen.axis_info) == 2:
         chosen = with_vertical(chosen, source_datum or height_datum)
     return CrsTransform(chosen, frame, height_datum, geoid)
+
+
+def local_output(crs: str) -> LocalTransform:
+    """The CRS of the product of a run in a local frame: that frame.
+
+    Args:
+        crs: "auto" or "local", from the configuration.
+
+    Returns:
+        The engineering CRS with the transform into it, which changes nothing.
+
+    Raises:
+        UsageError: Another CRS is asked for.
+    """
+    if crs.strip().lower() not in ("auto", "local"):
+        raise UsageError(
+            "E-CRS-07",
+            "the poses are in a local frame, and no CRS on earth can be reached from it",
+            where=_KEY,
+            found=crs,
+            expected="auto or local",
+            hint="--set ingest.crs=local; points on earth need poses with latitude and longitude",
+        )
+    return LocalTransform()
 
 
 def utm_zone(frame: LocalFrame) -> CRS:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -19,6 +19,27 @@ from pipeline.geometry.arrays import Floats
 # Half the step of the central differences: the grid's curvature is far below rounding over this length.
 _STEP_M = 10.0
 _ROUND_TRIP_M = 1e-3
+
+
+class FrameTransform(Protocol):
+    """Between the local frame and the CRS of a product or of data; points are (..., 3) x east, y north, z up."""
+
+    @property
+    def crs(self) -> CRS:
+        """The CRS."""
+
+    @property
+    def height_note(self) -> str:
+        """What is done with heights, in one line for the manifest and the report."""
+
+    def from_enu(self, p_in_enu_m: Floats) -> Floats:
+        """Points of the local frame (m) in the CRS."""
+
+    def enu_from(self, p_in_crs: Floats) -> Floats:
+        """Points of the CRS in the local frame (m)."""
+
+    def jacobian(self, p_in_enu_m: Floats) -> Floats:
+        """(..., 3, 3) derivative of the CRS's coordinates by ENU, at points of the local frame."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.transform import CrsTransform, to_enu
+from pipeline.geodesy.heights import LOCAL
+from pipeline.geodesy.local_world import LocalTransform
+from pipeline.geodesy.transform import FrameTransform, to_enu
 from pipeline.geometry.arrays import Bools, Floats
 from pipeline.lidar.tiles import Tile, read_returns
 
@@ -23,22 +25,29 @@ class LocalTiles:
 
     Args:
         tiles: What to read.
-        frame: The local frame.
+        frame: The local frame; None for tiles that are in it already, whether it is tied to a place on earth or not.
         geoid: Undulation in metres, a grid file, or None, as the configuration has it.
         height_datum: What the frame's heights are measured from.
     """
 
     tiles: tuple[Tile, ...]
-    frame: LocalFrame
-    geoid: float | str | None
-    height_datum: str
+    frame: LocalFrame | None = None
+    geoid: float | str | None = None
+    height_datum: str = LOCAL
 
-    def transform(self, tile: Tile) -> CrsTransform:
+    @property
+    def from_above(self) -> bool:
+        """Whether the tiles are surveys from the air; those in the run's own frame show ceilings and walls too."""
+        return self.frame is not None
+
+    def transform(self, tile: Tile) -> FrameTransform:
         """The way from a tile's CRS to the frame.
 
         Raises:
             UndeterminedError: A height datum or the geoid between two is not known.
         """
+        if self.frame is None:
+            return LocalTransform()
         return to_enu(tile.crs, self.frame, self.geoid, self.height_datum)
 
     def meeting(self, centres_in_enu_m: Floats, max_range_m: float) -> tuple[Tile, ...]:
@@ -75,7 +84,7 @@ def returns_near(local: LocalTiles, centres_in_enu_m: Floats, max_range_m: float
     """
     parts: list[Floats] = []
     stride, held = 1, 0
-    transforms: dict[str, CrsTransform] = {}
+    transforms: dict[str, FrameTransform] = {}
     for tile in local.tiles:
         if tile.crs_wkt not in transforms:
             transforms[tile.crs_wkt] = local.transform(tile)
@@ -102,7 +111,7 @@ def _near(points: Floats, centres: Floats, reach_m: float) -> Bools:
     return near
 
 
-def _box_in_crs(transform: CrsTransform, centres: Floats, reach_m: float) -> tuple[Floats, Floats]:
+def _box_in_crs(transform: FrameTransform, centres: Floats, reach_m: float) -> tuple[Floats, Floats]:
     """Lower and upper corner, in the tile's CRS, of the box about the cameras."""
     lower = centres.min(axis=0) - reach_m - _MARGIN_M
     upper = centres.max(axis=0) + reach_m + _MARGIN_M

@@ -13,6 +13,7 @@ from pyproj.exceptions import CRSError
 
 from pipeline.engine.errors import UndeterminedError, UsageError
 from pipeline.geodesy.heights import ELLIPSOIDAL, VERTICAL_EPSG, height_datum
+from pipeline.geodesy.local_world import LocalTransform, is_engineering
 
 # GeoTIFF keys (OGC 19-008r4, annex B; GeoTIFF 1.0 revision 1.8.2, 6.3.3 and 6.3.4).
 _GEODETIC, _PROJECTED, _VERTICAL, _VERTICAL_UNITS = 2048, 3072, 4096, 4099
@@ -48,6 +49,12 @@ def tile_crs(header: laspy.LasHeader, path: Path, height_datum: str | None = Non
             expected="a compound CRS, such as EPSG:32617+5703",
             hint=_tag_hint(path),
         )  # fmt: skip
+    if is_engineering(crs):
+        raise UndeterminedError(
+            "E-LIDAR-09", "the tile is in a frame of its own, and nothing says where on earth that lies",
+            where=str(path), found=f"{crs.name}, an engineering CRS", expected="a CRS on earth: the flight has one",
+            hint=_tag_hint(path),
+        )  # fmt: skip
     if has_heights(crs):
         return crs
     if height_datum is None:
@@ -58,6 +65,35 @@ def tile_crs(header: laspy.LasHeader, path: Path, height_datum: str | None = Non
             f"the EPSG code of their vertical CRS), or {_tag_hint(path, crs)}",
         )  # fmt: skip
     return _with_stated_heights(crs, height_datum, path)
+
+
+def local_tile_crs(header: laspy.LasHeader, path: Path) -> pyproj.CRS:
+    """The CRS of a tile that has to be in the run's own frame: no CRS at all, or an engineering CRS in metres.
+
+    Args:
+        header: The tile's header, extended records included.
+        path: Named in errors.
+
+    Returns:
+        The engineering CRS of local frames.
+
+    Raises:
+        UndeterminedError: The tile is somewhere on earth, or not in metres.
+    """
+    crs = _from_records(_projection_records(header), path)
+    if crs is not None and not is_engineering(crs):
+        raise UndeterminedError(
+            "E-LIDAR-10", "the tile is on earth, and nothing says where on earth the run's frame lies", where=str(path),
+            found=crs.name, expected="a tile in the frame of the poses, with no CRS or an engineering CRS",
+            hint="bring the tile into the frame of the poses, or leave score.lidar out to use the run's own sweeps",
+        )  # fmt: skip
+    if crs is not None and any(axis.unit_conversion_factor != 1.0 for axis in crs.axis_info):
+        raise UndeterminedError(
+            "E-LIDAR-11", "the tile is not in metres", where=str(path),
+            found=f"{crs.name}, {crs.axis_info[0].unit_name}", expected="metres, as the poses are",
+            hint="rewrite it in metres",
+        )  # fmt: skip
+    return LocalTransform().crs
 
 
 def _tag_hint(path: Path, crs: pyproj.CRS | None = None) -> str:

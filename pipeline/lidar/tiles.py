@@ -15,7 +15,7 @@ import pyproj
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bools, Floats
 from pipeline.lidar.public_header import check_public_header
-from pipeline.lidar.tile_crs import tile_crs
+from pipeline.lidar.tile_crs import local_tile_crs, tile_crs
 
 CHUNK_POINTS = 1_000_000
 SUFFIXES = (".las", ".laz")
@@ -103,8 +103,25 @@ def read_tile(path: Path, height_datum: str | None = None) -> Tile:
         UndeterminedError: The CRS or its vertical part is not known.
     """
     header = read_header(path)
+    return _tile(path, header, tile_crs(header, path, height_datum))
+
+
+def read_local_tile(path: Path) -> Tile:
+    """Reads the header of a tile in the run's own frame.
+
+    Args:
+        path: LAS, LAZ or COPC file with no CRS, or with an engineering CRS.
+
+    Raises:
+        InputError: Not a tile, or cut short.
+        UndeterminedError: The tile is on earth, or not in metres.
+    """
+    header = read_header(path)
+    return _tile(path, header, local_tile_crs(header, path))
+
+
+def _tile(path: Path, header: laspy.LasHeader, crs: pyproj.CRS) -> Tile:
     lower, upper = (tuple(float(x) for x in corner) for corner in (header.mins, header.maxs))
-    crs = tile_crs(header, path, height_datum)
     return Tile(
         path,
         crs.to_wkt(),

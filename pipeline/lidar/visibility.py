@@ -7,6 +7,8 @@ Returns are samples; what blocks a view are the surfaces between them. Two tests
   2.5-dimensional and needs no return on a wall.
 * z-buffer: in the image, a return is hidden or at a depth edge when its bin or a neighbouring one holds a return that
   is nearer by more than the slope of the surface explains; a return with no others around is dropped.
+
+Under a ceiling or a crown that was scanned from below nothing stands on columns: there the z-buffer is alone.
 """
 
 from __future__ import annotations
@@ -69,20 +71,22 @@ class VisibleReturns:
 
 
 def visible_returns(
-    view: View, points_in_enu_m: Floats, field: HeightField, spacing_m: float, max_range_m: float
+    view: View, points_in_enu_m: Floats, field: HeightField | None, spacing_m: float, max_range_m: float
 ) -> VisibleReturns:
     """The returns that a camera sees within a range.
 
     Args:
         view: The camera.
         points_in_enu_m: (n, 3) returns, ENU m.
-        field: The height field of the returns, everything between them and the camera included.
-        spacing_m: Of the returns on the ground, m.
+        field: The height field of the returns, everything between them and the camera included; None where returns are
+            not from above.
+        spacing_m: Between neighbouring returns, m.
         max_range_m: Largest Euclidean distance from the camera, m.
     """
     index, pixels, depth = in_image(view, points_in_enu_m, max_range_m)
-    seen = ~behind_columns(view.centre_in_enu_m, points_in_enu_m[index], field, max_range_m)
-    index, pixels, depth = index[seen], pixels[seen], depth[seen]
+    if field is not None:
+        seen = ~behind_columns(view.centre_in_enu_m, points_in_enu_m[index], field, max_range_m)
+        index, pixels, depth = index[seen], pixels[seen], depth[seen]
     footprint = view.camera.focal_px * spacing_m / depth
     seen = _passes_z_buffer(view.camera, pixels, depth, footprint)
     return VisibleReturns(index[seen], pixels[seen], depth[seen], footprint[seen])

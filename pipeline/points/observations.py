@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from pyarrow import feather
 
 from pipeline.flight import PairRow, column, columns
-from pipeline.geodesy.transform import CrsTransform
+from pipeline.geodesy.transform import FrameTransform
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats
 from pipeline.geometry.cameras import Camera, PixelSigma
 from pipeline.geometry.poses import Pose
@@ -45,7 +45,7 @@ class Scene:
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
     pairs: Mapping[str, PairRow]
-    transform: CrsTransform
+    transform: FrameTransform
     sigma: PixelSigma
     method: str
 

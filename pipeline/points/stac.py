@@ -46,8 +46,6 @@ def item(files: Sequence[TileFile], crs: CRS, item_id: str, description: str) ->
     """
     boxes = np.array([file.bounds for file in files])
     bounds = [*boxes[:, :3].min(axis=0).tolist(), *boxes[:, 3:].max(axis=0).tolist()]
-    ring = _footprint(crs, bounds)
-    corners = np.array(ring)
     rows = sum(file.rows for file in files)
     authority = crs.to_authority()
     return {
@@ -55,8 +53,7 @@ def item(files: Sequence[TileFile], crs: CRS, item_id: str, description: str) ->
         "stac_version": STAC_VERSION,
         "stac_extensions": list(EXTENSIONS),
         "id": item_id,
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-        "bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
+        **_where(crs, bounds),
         "properties": {
             "title": item_id,
             "description": description,
@@ -86,6 +83,18 @@ def item(files: Sequence[TileFile], crs: CRS, item_id: str, description: str) ->
             }
             for file in files
         },
+    }
+
+
+def _where(crs: CRS, bounds: Sequence[float]) -> dict[str, Any]:
+    """Footprint and box in longitude and latitude; an engineering CRS has none, and then STAC forbids the box."""
+    if crs.is_engineering:
+        return {"geometry": None}
+    ring = _footprint(crs, bounds)
+    corners = np.array(ring)
+    return {
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+        "bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
     }
 
 

@@ -15,6 +15,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
 from pipeline.lidar.nearby import LocalTiles, returns_near
 from pipeline.lidar.reference import Reference, reference_depth
+from pipeline.lidar.spacing import surface_spacing_m
 from pipeline.lidar.visibility import View, behind_columns, visible_returns
 from pipeline.scoring.calibration import CalibrationSums, MapSums
 from pipeline.scoring.depth_rows import AlignedDepths, align
@@ -77,16 +78,18 @@ class FrameScore:
 
 @dataclass(frozen=True, slots=True)
 class _Surroundings:
-    """The returns near a shard's frames, how far apart they are, and what stands there; no field without returns."""
+    """The returns near a shard's frames, how far apart they are, and what stands there, if they are from above."""
 
     returns: Floats
     spacing_m: float
     field: HeightField | None
 
     @staticmethod
-    def of(returns: Floats) -> _Surroundings:
+    def of(returns: Floats, from_above: bool) -> _Surroundings:
         if not len(returns):
             return _Surroundings(returns, np.nan, None)
+        if not from_above:
+            return _Surroundings(returns, surface_spacing_m(returns), None)
         spacing = return_spacing_m(returns)
         return _Surroundings(returns, spacing, HeightField.of(returns, spacing))
 
@@ -110,7 +113,7 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
         depths = dataset(job.depths).to_table(columns=_COLUMNS, filter=pc.field("frame_id").isin(ids))
     rows = align(depths, job.methods)
     centres = np.array([item.view.centre_in_enu_m for item in items])
-    near = _Surroundings.of(returns_near(job.tiles, centres, job.max_range_m))
+    near = _Surroundings.of(returns_near(job.tiles, centres, job.max_range_m), job.tiles.from_above)
     tables, scores = [], []
     for item in items:
         mine = rows.where(np.flatnonzero(rows.frame_id == item.frame_id))
@@ -144,7 +147,7 @@ def _distinct(depths: Path, column: str) -> set[str]:
 
 def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: float) -> tuple[Reference, int]:
     """Reference depths at pixels within range, and how many returns the frame sees."""
-    if near.field is None or not len(pixels):
+    if not len(near.returns) or not len(pixels):
         nothing = np.full(len(pixels), np.nan)
         return Reference(nothing, nothing, np.zeros(len(pixels), np.bool_)), 0
     visible = visible_returns(view, near.returns, near.field, near.spacing_m, max_range_m)
@@ -153,9 +156,10 @@ def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: flo
     rays, focal = view.camera.rays(distinct), view.camera.focal_px
     found = reference_depth(distinct, focal * rays[:, :2], visible, focal * view.camera.rays(visible.pixels)[:, :2])
     valid = found.valid & (found.depth_m * np.linalg.norm(rays, axis=1) <= max_range_m)
-    # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.
-    points = view.centre_in_enu_m + (found.depth_m[:, None] * rays)[valid] @ view.rotation_enu_from_cam.T
-    valid[valid] = ~behind_columns(view.centre_in_enu_m, points, near.field, max_range_m)
+    if near.field is not None:
+        # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.
+        points = view.centre_in_enu_m + (found.depth_m[:, None] * rays)[valid] @ view.rotation_enu_from_cam.T
+        valid[valid] = ~behind_columns(view.centre_in_enu_m, points, near.field, max_range_m)
     back = back.ravel()
     depth, spread = (np.where(valid, values, np.nan)[back] for values in (found.depth_m, found.spread_m))
     return Reference(depth, spread, valid[back]), len(visible.depth_m)

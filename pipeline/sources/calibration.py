@@ -24,6 +24,7 @@ _MODELS = {
     "radtan": "brown",
     "equidistant": "fisheye",
     "fisheye": "fisheye",
+    "kannala_brandt": "fisheye",
     "none": "pinhole",
     "": "",
 }
@@ -84,21 +85,46 @@ def parse_calibration(data: bytes, where: str = "") -> Camera:
     if not isinstance(content, Mapping):
         raise _wrong(where, type(content).__name__, "a mapping with image_width, camera_matrix, ...")
     matrix = _numbers(_value(content, _MATRIX, where), where)
-    if len(matrix) != 9:
-        raise _wrong(where, f"a camera matrix of {len(matrix)} numbers", "9, row by row")
     width, height = (_integer(_value(content, names, where), where) for names in _SIZE)
     distortion = _numbers(_value(content, _DISTORTION, where, default=()), where)
-    model = _model(content, distortion, where)
+    return camera_of_values(_stated_model(content), width, height, matrix, distortion, where)
+
+
+def camera_of_values(
+    stated: str, width: int, height: int, matrix: Sequence[float], distortion: Sequence[float], where: str = ""
+) -> Camera:
+    """The camera of a calibration's numbers, whatever they were written in.
+
+    Args:
+        stated: Lens model by ROS's name, any case; empty for the one that the coefficients fit.
+        width: Image width, px.
+        height: Image height, px.
+        matrix: K row by row.
+        distortion: Coefficients in OpenCV's order.
+        where: For messages.
+
+    Raises:
+        InputError: The model is not known, the coefficients are not of it, or no lens can be like it.
+
+    Source: sensor_msgs/CameraInfo; foxglove.CameraCalibration for kannala_brandt.
+    """
+    if len(matrix) != 9:
+        raise _wrong(where, f"a camera matrix of {len(matrix)} numbers", "9, row by row")
+    model = _model(stated.strip().lower(), distortion, where)
     camera = Camera(model, width, height, matrix[0], matrix[4], matrix[2], matrix[5], _trimmed(model, distortion))
     return checked(camera, where)
 
 
-def _model(content: Mapping[str, object], distortion: tuple[float, ...], where: str) -> str:
+def _stated_model(content: Mapping[str, object]) -> str:
     stated = str(content.get("distortion_model", content.get("camera_model", "")) or "").strip().lower()
     stated = "" if stated in {"pinhole", "perspective"} else stated
+    return "fisheye" if not stated and content.get("fisheye_model") == 1 else stated
+
+
+def _model(stated: str, distortion: Sequence[float], where: str) -> str:
     if stated not in _MODELS:
         raise _wrong(where, f"distortion_model {stated}", ", ".join(name for name in _MODELS if name))
-    model = _MODELS[stated] or ("fisheye" if content.get("fisheye_model") == 1 else "brown")
+    model = _MODELS[stated] or "brown"
     # OpenCV pads its vector with zeros (12 for thin prism, 14 for tilt); zeros beyond the model are no claim.
     count = len(distortion)
     beyond = distortion[_COUNTS[model][-1] :]
@@ -107,8 +133,8 @@ def _model(content: Mapping[str, object], distortion: tuple[float, ...], where: 
     return "pinhole" if not any(distortion) and model == "brown" else model
 
 
-def _trimmed(model: str, distortion: tuple[float, ...]) -> tuple[float, ...]:
-    return distortion[: _COUNTS[model][-1]]
+def _trimmed(model: str, distortion: Sequence[float]) -> tuple[float, ...]:
+    return tuple(distortion[: _COUNTS[model][-1]])
 
 
 def _value(content: Mapping[str, object], names: Sequence[str], where: str, default: object = None) -> object:

@@ -109,7 +109,7 @@ def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, A
     """Refuses heights that cannot meet LiDAR's, tiles that cannot be read or placed, and having no reference at all."""
     del setting
     if config.lidar is None:
-        if not facts.get("sweep_returns"):
+        if not facts.get("sweep_points"):
             raise nothing_to_score_against()
         return
     if not _is_local(facts):
@@ -124,7 +124,7 @@ def _is_local(facts: Mapping[str, Any]) -> bool:
 
 def _sweeps(folder: Path) -> tuple[Path, ...]:
     """The tiles of the run's own sweeps, which are in the run's frame."""
-    tiles = tuple(sorted(folder.glob("*.laz")))
+    tiles = tuple(sorted(folder.rglob("*.laz")))
     if not tiles:
         raise nothing_to_score_against()
     return tiles

@@ -252,7 +252,7 @@ def test_without_tiles_the_runs_own_sweeps_are_the_reference(tmp_path: Path, wor
     # Heights above take-off are as good as any here: sweeps and cameras were posed alike.
     context = local_context(tmp_path) if world == "local" else make_context(tmp_path, datum="takeoff")
     config = score.Config()
-    score.foresee(config, settings("auto"), {**context.ingest, "sweep_returns": returns})
+    score.foresee(config, settings("auto"), {**context.ingest, "sweep_points": returns})
     score.STAGE.run(config, context)
     methods = scores(context)["methods"]
     assert methods["dlt"]["all"]["abs_rel"] == pytest.approx(0.2, abs=2e-4)

@@ -95,8 +95,8 @@ def by_tile(points_m: Floats, voxel_m: float, voxels_per_tile: int) -> Iterator[
     offset = points_m - cell * voxel_m
     order = np.lexsort((tile[:, 1], tile[:, 0]))
     tile = tile[order]
-    starts = np.flatnonzero(np.concatenate([[True], np.any(tile[1:] != tile[:-1], axis=1)])) if len(tile) else []
-    for rows in np.split(order, starts[1:]) if len(starts) else ():
+    ends = np.flatnonzero(np.any(tile[1:] != tile[:-1], axis=1)) + 1
+    for rows in np.split(order, ends) if len(order) else ():
         column, row = cell[rows[0], :2] // voxels_per_tile
         yield (int(column), int(row)), Voxels(key[rows], np.ones(len(rows), np.int64), offset[rows]).thinned()
 

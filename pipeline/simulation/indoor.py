@@ -62,6 +62,7 @@ bags = "bag"
 pose_topic = "{POSE_TOPIC}"
 image_topic = "{IMAGE_TOPIC}"
 up_axis = "y"
+frame_spacing_m = 0.2
 
 [pair]
 baseline_m = [0.3, 1.2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -116,6 +117,29 @@ def relative_poses_of(table: pa.Table) -> dict[str, RelativePose]:
         pair_id: RelativePose(rotation[i], translation[i], np.array(covariance[i]).reshape(6, 6))
         for i, pair_id in enumerate(table.column("pair_id").to_pylist())
     }
+
+
+# Images that ingest took out of a bag or video lie in the run folder, and are named so.
+RUN_IMAGES = "run://images/"
+
+
+def image_locations(frames: pa.Table, photo_root: str, run_images: Path) -> dict[str, str]:
+    """Where the image of every usable frame lies, by frame_id.
+
+    Args:
+        frames: The `frames` table.
+        photo_root: Where ingest found the photos.
+        run_images: The run folder's `images`.
+
+    Returns:
+        Paths or URLs.
+    """
+    usable = frames.filter(frames.column("usable"))
+    ids, images = (usable.column(name).to_pylist() for name in ("frame_id", "image"))
+    inside = {
+        image: str(run_images / image.removeprefix(RUN_IMAGES)) for image in images if image.startswith(RUN_IMAGES)
+    }
+    return {frame: inside.get(image) or f"{photo_root}/{image}" for frame, image in zip(ids, images, strict=True)}
 
 
 def camera_by_frame(frames: pa.Table, cameras: Mapping[str, Camera]) -> dict[str, Camera]:

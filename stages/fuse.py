@@ -14,7 +14,7 @@ from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
-from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
+from pipeline.flight import camera_by_frame, cameras_of, image_locations, poses_of, selected_pairs
 from pipeline.geodesy.crs import local_output, output_crs
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, is_orthometric
@@ -94,9 +94,8 @@ def _scene(context: Context) -> Scene:
     facts = context.facts("ingest")
     usable = frames.filter(frames.column("usable"))
     ids = usable.column("frame_id").to_pylist()
-    images = usable.column("image").to_pylist()
     return Scene(
-        {frame: f"{facts['photo_root']}/{image}" for frame, image in zip(ids, images, strict=True)},
+        image_locations(frames, str(facts["photo_root"]), context.path("images")),
         dict(zip(ids, usable.column("time").cast("int64").to_pylist(), strict=True)),
         camera_by_frame(frames, cameras_of(context.read("cameras"))),
         poses_of(context.read("poses")),
@@ -122,7 +121,7 @@ STAGE = Stage(
     "fuse",
     1,
     Config,
-    ("frames", "cameras", "poses", "pairs", "depths"),
+    ("frames", "cameras", "poses", "pairs", "depths", "images"),
     ("points",),
     run,
     reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px", "match.max_image_px"),

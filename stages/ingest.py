@@ -1,56 +1,104 @@
-"""ingest: photos and their exposure marks into frames, cameras, tracks and clocks."""
+"""ingest: photos, logs, bags and videos into frames, cameras, tracks and clocks."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import Field, field_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from pipeline.engine.errors import EpiTransferError
-from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.geodesy.heights import height_datum
-from pipeline.sources.calibration import read_calibration
+from pipeline.placing import steps
+from pipeline.placing.gather import files_of, find_logs
+from pipeline.placing.tables import clock_row, track_pieces
+from pipeline.placing.telling import record_facts, summary, warn_of
 from pipeline.sources.datums import AUTO
-from pipeline.sources.exposures import MarkFile
-from pipeline.sources.files import MARK_SUFFIXES, beside, common_root, find_images, is_url, opened
-from pipeline.sources.frames import Ingested, assemble
-from pipeline.sources.intrinsics import SourcedCamera
-from pipeline.sources.mrk import read_marks
-from pipeline.sources.photos import PhotoRecord, read_photo
+from pipeline.sources.files import MARK_SUFFIXES, beside, common_root, find, find_images, is_url
+from pipeline.sources.frames import assemble
+from pipeline.sources.video import VIDEO_SUFFIXES, srt_beside
+from pipeline.tracks.mount import Mount
 
-_SHARD = 32
+
+class MountConfig(BaseModel):
+    """How a sensor sits on the vehicle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    yaw_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, 90 right (deg)")
+    pitch_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, -90 down (deg)")
+    roll_deg: float | None = Field(default=None, description="About the optical axis, clockwise (deg)")
+    lever_arm_m: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="From the antenna, or what is posed, to the sensor: forward, right, down (m)"
+    )
+
+    def mount(self) -> Mount:
+        """As geometry; angles that are not stated are none where none is, and 0 beside others."""
+        angles = (self.yaw_deg, self.pitch_deg, self.roll_deg)
+        if all(angle is None for angle in angles):
+            return Mount(None, self.lever_arm_m)
+        yaw, pitch, roll = (float(np.radians(angle or 0.0)) for angle in angles)
+        return Mount((yaw, pitch, roll), self.lever_arm_m)
+
+
+_Paths = str | tuple[str, ...] | None
+_PATH: dict[str, Any] = {"path": True}
 
 
 class Config(StageConfig):
     """What to read, and what the files do not say of themselves."""
 
-    photos: str | tuple[str, ...] = Field(
-        description="Folder, glob or URL of photos, or a list of these", json_schema_extra={"path": True}
+    photos: _Paths = Field(
+        None, description="Folder, glob or URL of photos, or a list of these", json_schema_extra=_PATH
+    )
+    videos: _Paths = Field(None, description="DJI videos with their .SRT beside them", json_schema_extra=_PATH)
+    logs: _Paths = Field(
+        None,
+        description="Logs and trajectories that say where the photos were taken: ArduPilot .BIN/.log, MAVLink .tlog, "
+        "PX4 .ulg, ROS and MCAP bags, DJI .SRT/.csv, TUM or CSV trajectories, COLMAP models",
+        json_schema_extra=_PATH,
+    )
+    bags: _Paths = Field(
+        None, description="ROS or MCAP bags whose own images are used, with their poses", json_schema_extra=_PATH
     )
     camera: str | None = Field(
         None,
         description="Calibration file of all photos: ROS camera_info or OpenCV YAML; wins over the photos' own tags",
-        json_schema_extra={"path": True},
+        json_schema_extra=_PATH,
     )
+    mount: MountConfig = Field(
+        MountConfig(), description="The camera on the vehicle: yaw_deg, pitch_deg, roll_deg, lever_arm_m"
+    )
+    lidar_mount: MountConfig | None = Field(
+        None, description="The LiDAR (axes forward, left, up) on what is posed, where a bag does not say: as mount"
+    )
+    pose_topic: str | None = Field(
+        None, description="Topic of the poses to use in bags with several; none: the longest"
+    )
+    image_topic: str | None = Field(None, description="Topic of the images to use in bags; none: the longest")
+    up_axis: Literal["z", "y"] = Field("z", description="Which axis of a local frame points up: y in motion capture")
+    frame_spacing_m: float = Field(1.0, gt=0.0, description="Way between two images taken out of a bag or video (m)")
     height_datum: str = Field(
         AUTO,
-        description="What the photos' altitudes are measured from: ellipsoidal, egm96, egm2008, navd88, takeoff, "
-        "local (no tie to other data); auto: ellipsoidal with RTK, else above take-off, else unknown",
+        description="What the absolute heights are measured from: ellipsoidal, egm96, egm2008, navd88, takeoff, "
+        "local (no tie to other data); auto: ellipsoidal where the source knows it, else above take-off, else unknown",
     )
     geoid: float | str | None = Field(
         None,
         description="Height of the geoid above the ellipsoid here (m), or a grid file that PROJ reads; used wherever "
         "an orthometric height meets an ellipsoidal one",
-        json_schema_extra={"path": True},
+        json_schema_extra=_PATH,
     )
     crs: str = Field(
         "auto", description="CRS of the points, any text PROJ takes; auto: the UTM zone, with its vertical part"
     )
-    clock_offset_s: float = Field(0.0, description="Added to the photos' own times to make them UTC (s)")
+    clock_offset_s: float | Literal["auto"] = Field(
+        "auto", description="Added to the photos' own times to make them UTC (s); auto: found from the logs, else none"
+    )
 
     @field_validator("height_datum")
     @classmethod
@@ -62,117 +110,92 @@ class Config(StageConfig):
         except EpiTransferError as error:
             raise ValueError(f"{error.expected}; {error.hint}") from error
 
+    @model_validator(mode="after")
+    def _something(self) -> Config:
+        if not (self.photos or self.bags or self.videos):
+            raise ValueError("name photos, bags or videos: something has to hold the images")
+        return self
+
 
 def run(config: Config, context: Context) -> str:
-    """Reads all photos and writes the four tables; a photo that cannot be used is a row with its reason."""
-    locations = find_images(_listed(config.photos))
-    marks, unread = _marks(locations)
-    calibration = read_calibration(config.camera) if config.camera else None
-    records: list[PhotoRecord] = []
-    for part in context.map(partial(_read, calibration), locations, shard=_SHARD, label="photos"):
-        records.extend(part)
-    root = photo_root(config)
+    """Reads everything and writes the tables; an image that cannot be used is a row with its reason."""
+    wishes = _wishes(config)
+    root, photos = photo_root(config), _photos(config)
+    sources = steps.read_sources(context, find_logs(config.logs), find_logs(config.bags), _videos(config), wishes)
+    images = steps.extract(context, sources, wishes)
+    records = steps.read_photos(context, photos, images, sources, wishes)
+    placed = steps.placed(records, images, sources, wishes)
+    marks, unread = steps.exposure_marks(photos)
+    lines = [source.line for source in sources]
     found = assemble(
-        records,
+        placed.records,
         marks,
         root=root,
         height_datum=config.height_datum,
         geoid=config.geoid,
-        clock_offset_s=config.clock_offset_s,
+        clock_offset_s=wishes.clock_offset_s or 0.0,
+        log_clocks=[*(clock_row(line, root) for line in lines), *placed.clocks],
     )
     context.write("frames", found.frames)
     context.write("cameras", found.cameras)
-    context.write("tracks", found.tracks)
+    context.write_pieces("tracks", chain([found.tracks], *(track_pieces(line, root) for line in lines)))
     context.write("clocks", found.clocks)
-    _record(context, found, root, records)
-    usable = found.frames.column("usable").to_pylist()
-    context.count_items(len(usable), usable.count(False))
-    for text in [*unread, *(f"{name}: {why}" for name, why in sorted(found.exposures.problems.items()))]:
-        context.warn(f"exposure marks not used: {text}")
-    _warn_of_unusable(context, found, len(usable))
-    zoneless = [record.time_source for record in records].count("exif (zone unknown)")
-    if zoneless and not config.clock_offset_s:
-        context.warn(
-            f"{zoneless} photos do not say their time zone; their local time is read as UTC (state the difference: "
-            "--set ingest.clock_offset_s=-36000 for ten hours east)"
-        )
-    marked = len(found.exposures.of_photo)
-    return (
-        f"{usable.count(True)} of {len(usable)} photos usable, {counted(found.cameras.num_rows, 'camera')}, heights "
-        f"{found.heights.stated}" + (f", {marked} with RTK exposure marks" if marked else "")
+    context.record("sweep_points", steps.write_sweeps_of(context, sources, found.origin, wishes))
+    record_facts(context, found, placed, root)
+    warn_of(context, found, placed, lines, unread, stated=wishes.clock_offset_s is not None)
+    return summary(found)
+
+
+def _wishes(config: Config) -> steps.Wishes:
+    return steps.Wishes(
+        camera=config.camera,
+        mount=config.mount.mount(),
+        lidar_mount=config.lidar_mount.mount() if config.lidar_mount else None,
+        pose_topic=config.pose_topic,
+        image_topic=config.image_topic,
+        y_up=config.up_axis == "y",
+        spacing_m=config.frame_spacing_m,
+        clock_offset_s=None if config.clock_offset_s == "auto" else float(config.clock_offset_s),
     )
 
 
 def photo_root(config: Config) -> str:
-    """The deepest folder that holds all photos and exposure marks: the images' paths are relative to it."""
-    locations = find_images(_listed(config.photos))
-    return common_root([*locations, *beside(locations, MARK_SUFFIXES)])
+    """The deepest folder that holds all photos and exposure marks, or without photos all logs and videos.
+
+    The images' paths are relative to it.
+    """
+    photos = _photos(config)
+    named = [*photos, *beside(photos, MARK_SUFFIXES)] or [*find_logs(config.bags), *_videos(config)]
+    return common_root(named)
 
 
 def sources(config: Config) -> Sequence[Path | str]:
-    """The files whose bytes decide: photos, exposure marks, calibration, geoid grid."""
-    locations = find_images(_listed(config.photos))
-    named = [*locations, *beside(locations, MARK_SUFFIXES)]
-    named += [text for text in (config.camera, config.geoid) if isinstance(text, str)]
+    """The files whose bytes decide: photos, marks, logs, bags, videos and subtitles, calibration, geoid grid."""
+    photos, videos = _photos(config), _videos(config)
+    named = [*photos, *beside(photos, MARK_SUFFIXES), *videos]
+    named += files_of([*find_logs(config.logs), *find_logs(config.bags)])
+    named += [text for text in (config.camera, config.geoid, *map(srt_beside, videos)) if isinstance(text, str)]
     return [name if is_url(name) else Path(name) for name in named]
 
 
-def _listed(photos: str | tuple[str, ...]) -> Sequence[str]:
-    return [photos] if isinstance(photos, str) else list(photos)
+def _photos(config: Config) -> list[str]:
+    return find_images(_listed(config.photos)) if config.photos else []
 
 
-def _read(calibration: SourcedCamera | None, locations: Sequence[str]) -> list[PhotoRecord]:
-    return [read_photo(location, calibration) for location in locations]
+def _videos(config: Config) -> list[str]:
+    return sorted({video for name in _listed(config.videos) for video in find(name, VIDEO_SUFFIXES)})
 
 
-def _marks(locations: Sequence[str]) -> tuple[list[MarkFile], list[str]]:
-    """The exposure marks beside the photos. A damaged file stops the run: poses would silently be metres worse."""
-    files, empty = [], []
-    for location in beside(locations, MARK_SUFFIXES):
-        with opened(location) as stream:
-            data = stream.read()
-        if data.strip(b"\x00 \t\r\n"):
-            files.append(MarkFile(location, tuple(read_marks(data, location))))
-        else:
-            # Drones without a base station write the file and leave it empty.
-            empty.append(f"{location} is empty")
-    return files, empty
-
-
-def _record(context: Context, found: Ingested, root: str, records: Sequence[PhotoRecord]) -> None:
-    """Facts that later stages and the manifest need."""
-    origin = found.origin
-    context.record("photo_root", root)
-    context.record("height_datum", found.heights.stated)
-    context.record("height_datum_why", found.heights.why)
-    context.record("files", len(records))
-    context.record(
-        "origin",
-        None
-        if origin is None
-        else {
-            "latitude_deg": origin.latitude_deg,
-            "longitude_deg": origin.longitude_deg,
-            "height_m": origin.height_m,
-        },
-    )
-    zones = Counter(record.time_source for record in records if record.time_source)
-    context.record("time_sources", dict(sorted(zones.items())))
-
-
-def _warn_of_unusable(context: Context, found: Ingested, total: int) -> None:
-    table = found.frames.filter(found.frames.column("usable").to_numpy(zero_copy_only=False) == False)  # noqa: E712
-    if table.num_rows:
-        first = table.slice(0, 1).to_pylist()[0]
-        context.warn(f"{table.num_rows} of {total} photos are not usable, first {first['image']}: {first['problem']}")
+def _listed(names: _Paths) -> Sequence[str]:
+    return [] if names is None else [names] if isinstance(names, str) else list(names)
 
 
 STAGE = Stage(
     "ingest",
-    1,
+    2,
     Config,
     (),
-    ("frames", "cameras", "tracks", "clocks"),
+    ("frames", "cameras", "tracks", "clocks", "images", "sweeps"),
     run,
     sources=sources,
     place=("photo_root", photo_root),

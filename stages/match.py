@@ -15,7 +15,7 @@ from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import dataset
-from pipeline.flight import PairRow, camera_by_frame, cameras_of, poses_of, selected_pairs
+from pipeline.flight import PairRow, camera_by_frame, cameras_of, image_locations, poses_of, selected_pairs
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, relative_pose
 from pipeline.matching.features import Extractor, SiftExtractor, cached_features
@@ -94,12 +94,12 @@ def _images(context: Context) -> dict[str, _Image]:
     frames = context.read("frames")
     cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
     poses = poses_of(frames)
-    root = str(context.facts("ingest")["photo_root"])
+    where = image_locations(frames, str(context.facts("ingest")["photo_root"]), context.path("images"))
     usable = frames.filter(frames.column("usable"))
-    names = (usable.column(name).to_pylist() for name in ("frame_id", "image", "image_sha256"))
+    names = (usable.column(name).to_pylist() for name in ("frame_id", "image_sha256"))
     return {
-        frame_id: _Image(f"{root}/{image}", digest, cameras[frame_id], poses[frame_id])
-        for frame_id, image, digest in zip(*names, strict=True)
+        frame_id: _Image(where[frame_id], digest, cameras[frame_id], poses[frame_id])
+        for frame_id, digest in zip(*names, strict=True)
     }
 
 
@@ -145,4 +145,4 @@ def _count(folder: Path) -> dict[str, tuple[int, int]]:
     return {row["pair_id"]: (row["inlier_count"], row["inlier_sum"]) for row in grouped.to_pylist()}
 
 
-STAGE = Stage("match", 1, Config, ("frames", "cameras", "pairs"), ("matches",), run, facts_of=("ingest",))
+STAGE = Stage("match", 1, Config, ("frames", "cameras", "pairs", "images"), ("matches",), run, facts_of=("ingest",))

@@ -1,6 +1,7 @@
 """Ingest as a whole: from folders of photos to the four tables."""
 
 import json
+import tempfile
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -34,10 +35,19 @@ class Recorder:
         self.known: dict[str, Any] = {}
         self.warnings: list[str] = []
         self.items = (0, 0)
+        self.folder = tempfile.TemporaryDirectory()
 
     def write(self, name: str, table: pa.Table) -> None:
         TABLES[name].check(table)
         self.tables[name] = table
+
+    def write_pieces(self, name: str, pieces: Iterable[pa.Table]) -> None:
+        self.write(name, pa.concat_tables(list(pieces)))
+
+    def output(self, name: str) -> Path:
+        folder = Path(self.folder.name) / name
+        folder.mkdir(exist_ok=True)
+        return folder
 
     def record(self, key: str, value: Any) -> None:
         self.known[key] = json.loads(json.dumps(value, allow_nan=False))

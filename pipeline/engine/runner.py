@@ -25,7 +25,7 @@ from pipeline.engine.executors import Executor
 from pipeline.engine.progress import Reporter
 from pipeline.engine.runfolder import DATASETS, RunFolder, output_name, tree_size, write_text
 from pipeline.engine.stage import Stage
-from pipeline.engine.tables import check_stored, parquet_files, read_table, write_table
+from pipeline.engine.tables import check_stored, parquet_files, read_table, write_pieces, write_table
 from schemas import TABLES
 
 # What changes no output, so that following a hint about it does not run the stage again.
@@ -268,6 +268,9 @@ class _StageContext:
         TABLES[name].check(table)
         write_table(self.output(name), table)
 
+    def write_pieces(self, name: str, pieces: Iterable[pa.Table]) -> None:
+        write_pieces(self.output(name), TABLES[name].arrow(), (_checked(name, piece) for piece in pieces))
+
     def setting(self, key: str) -> Any:
         if key not in self.stage.reads:
             raise KeyError(f"{self.stage.name} does not declare that it reads {key}")
@@ -313,6 +316,11 @@ class _StageContext:
         with self.reporter.meter(self.stage.name, label, sum(len(part) for _, part in numbered)) as meter:
             for (_, part), _done in zip(numbered, self.executor.map(job, numbered), strict=True):
                 meter.advance(len(part))
+
+
+def _checked(name: str, table: pa.Table) -> pa.Table:
+    TABLES[name].check(table)
+    return table
 
 
 def _write_part(

@@ -39,6 +39,9 @@ class Context(Protocol):
     def write(self, name: str, table: pa.Table) -> None:
         """Writes an output table as a whole."""
 
+    def write_pieces(self, name: str, pieces: Iterable[pa.Table]) -> None:
+        """Writes an output table from pieces that need not fit into memory together."""
+
     def setting(self, key: str) -> Any:
         """The value of another stage's key ("ingest.geoid"); the stage must declare it in `reads`."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,18 +18,24 @@ _ROW_GROUP = 131_072
 
 def write_table(path: Path, table: pa.Table) -> None:
     """Writes a table so that equal tables give equal bytes: zstd, byte-stream-split floats, dictionaries on text."""
-    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
-    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
-    pq.write_table(
-        table,
+    write_pieces(path, table.schema, [table])
+
+
+def write_pieces(path: Path, schema: pa.Schema, pieces: Iterable[pa.Table]) -> None:
+    """As `write_table`, from pieces that need not fit into memory together."""
+    floats = [field.name for field in schema if pa.types.is_floating(field.type)]
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    with pq.ParquetWriter(
         path,
+        schema,
         compression="zstd",
         compression_level=3,
         use_dictionary=texts,
         use_byte_stream_split=floats,
-        row_group_size=_ROW_GROUP,
         write_page_checksum=True,
-    )
+    ) as writer:
+        for piece in pieces:
+            writer.write_table(piece, row_group_size=_ROW_GROUP)
 
 
 def parquet_files(path: Path) -> list[Path]:

@@ -178,3 +178,19 @@ def gimbal_error_axes(rotation_enu_from_cam: Floats) -> Floats:
     length = np.linalg.norm(forward, axis=-1, keepdims=True)
     forward = np.where(length > 1e-9, forward / np.maximum(length, 1e-9), np.array([0.0, 1.0, 0.0]))
     return np.stack([down, right, forward], axis=-1)
+
+
+def vector_from_rotation(rotation: Floats) -> Floats:
+    """The rotation vector of a rotation matrix; the inverse of `rotation_from_vector` below half a turn.
+
+    Args:
+        rotation: (..., 3, 3).
+
+    Returns:
+        (..., 3) rad.
+    """
+    q = quaternion_from_rotation(rotation)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., :1])
+    out: Floats = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0) * q[..., 1:]
+    return out

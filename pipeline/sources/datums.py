@@ -35,9 +35,11 @@ class Heights:
 def own_datum(record: PhotoRecord) -> str:
     """What the best height of a photo is measured from; empty where it has none.
 
-    A receiver with RTK logs ellipsoidal heights. Without it DJI's AbsoluteAltitude is of no certain datum (sea level by
+    A log may say the ellipsoidal height itself, and a receiver with RTK logs ellipsoidal heights. Without either DJI's AbsoluteAltitude is of no certain datum (sea level by
     barometer or by the receiver's geoid, metres to tens of metres apart), but the height above take-off is known.
     """
+    if record.ellipsoidal_m is not None:
+        return ELLIPSOIDAL
     if record.absolute_m is not None and (record.fix.rtk_flag or 0) >= RTK_SINGLE:
         return ELLIPSOIDAL
     if record.relative_m is not None:
@@ -66,7 +68,7 @@ def resolve(records: Sequence[PhotoRecord], stated: str, geoid: float | str | No
         # Of equally many the better known datum wins.
         datum = max(order, key=lambda name: (votes[name], -order.index(name))) if votes else UNKNOWN
         why = {
-            ELLIPSOIDAL: "the receiver's RTK heights are ellipsoidal",
+            ELLIPSOIDAL: "the receiver's heights above the ellipsoid are known",
             TAKEOFF: "no RTK: heights above the take-off point",
             UNKNOWN: "no RTK and no height above take-off: the altitude's datum is not known",
         }[datum]
@@ -84,19 +86,26 @@ def _height(record: PhotoRecord, datum: str, *, automatic: bool) -> float | None
         return record.relative_m
     if datum == LOCAL and record.absolute_m is None:
         return record.relative_m
+    if datum == ELLIPSOIDAL and record.ellipsoidal_m is not None:
+        return record.ellipsoidal_m
     if automatic and datum == ELLIPSOIDAL and own_datum(record) != ELLIPSOIDAL:
         return None
+    if is_orthometric(datum) and record.absolute_m is None:
+        return record.ellipsoidal_m
     return record.absolute_m
 
 
 def _ellipsoidal(
     records: Sequence[PhotoRecord], values: Sequence[float | None], geoid: Geoid
 ) -> tuple[float | None, ...]:
-    """Orthometric heights plus the geoid's; heights of exposure marks are ellipsoidal already."""
+    """Orthometric heights plus the geoid's; what a mark or a log says of the ellipsoid itself is ellipsoidal already."""
     rows = [
         row
         for row, (record, value) in enumerate(zip(records, values, strict=True))
-        if value is not None and record.position is not None and record.position.source != "mrk position"
+        if value is not None
+        and record.absolute_m is not None
+        and record.position is not None
+        and record.position.source != "mrk position"
     ]
     out = list(values)
     if rows:

@@ -54,6 +54,7 @@ class Fix:
     sigma_north_m: float | None = None
     sigma_up_m: float | None = None
     sigma_horizontal_m: float | None = None
+    sigma_vertical_m: float | None = None
 
 
 class Unusable(ValueError):  # noqa: N818 - a verdict on one photo, not an error of the program

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any
@@ -14,11 +14,11 @@ import pyarrow as pa
 
 from pipeline.engine.errors import InputError
 from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.heights import ELLIPSOIDAL, TAKEOFF
+from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.rotations import enu_from_cam, gimbal_angles, quaternion_from_rotation
 from pipeline.sources import datums, exposures
-from pipeline.sources.accuracy import pose_sigmas
+from pipeline.sources.accuracy import LOCAL_POSES, pose_sigmas, widened
 from pipeline.sources.exposures import Exposures, MarkFile
 from pipeline.sources.files import relative_to
 from pipeline.sources.photos import PhotoRecord
@@ -26,6 +26,8 @@ from schemas import CAMERAS, CLOCKS, FRAMES, TRACKS
 
 # A photo clock is set by hand or by the last GPS fix; without a zone it can be off by the zone, too.
 _PHOTO_CLOCK_SIGMA_S = 1.0
+# Whether poses are tied to a place on earth, or only to each other.
+EARTH, LOCAL_WORLD = "earth", "local"
 _AXES = ("east", "north", "up")
 _ANGLES = ("yaw", "pitch", "roll")
 
@@ -41,6 +43,7 @@ class Ingested:
     heights: datums.Heights
     exposures: Exposures
     origin: LocalFrame | None
+    world: str
 
 
 def assemble(
@@ -50,9 +53,10 @@ def assemble(
     root: str,
     height_datum: str,
     geoid: float | str | None,
-    clock_offset_s: float,
+    clock_offset_s: float = 0.0,
+    log_clocks: Sequence[Mapping[str, Any]] = (),
 ) -> Ingested:
-    """Puts photos and exposure marks together.
+    """Puts photos, their exposure marks and what the logs said of them together.
 
     Args:
         records: The photos in order.
@@ -61,6 +65,7 @@ def assemble(
         height_datum: As `datums.resolve`.
         geoid: As `datums.resolve`.
         clock_offset_s: Added to the photos' own times, s.
+        log_clocks: Rows of `clocks` from the logs: their own clocks, and the cameras' against them.
 
     Raises:
         InputError: Two images have the same stem.
@@ -70,9 +75,10 @@ def assemble(
     _check_unique(records)
     found = exposures.associate(records, marks, clock_offset_s)
     placed = [exposures.apply(record, found.of_photo.get(record.location)) for record in records]
-    heights = datums.resolve(placed, height_datum, geoid)
+    world = LOCAL_WORLD if any(r.local_m and r.position is None for r in placed if not r.problem) else EARTH
+    heights = _local_heights(placed) if world == LOCAL_WORLD else datums.resolve(placed, height_datum, geoid)
     judged = [_judged(record, value, heights) for record, value in zip(placed, heights.values_m, strict=True)]
-    origin = _origin(judged, heights.values_m)
+    origin = None if world == LOCAL_WORLD else _origin(judged, heights.values_m)
     camera_ids, cameras = _cameras(judged)
     enu = _positions(judged, heights.values_m, origin)
     quaternions, angles = _attitudes(judged, origin)
@@ -92,11 +98,17 @@ def assemble(
         FRAMES.from_rows(rows),
         cameras,
         _tracks(records, marks, root),
-        _clocks(records, found, root, clock_offset_s),
+        _clocks(records, found, root, clock_offset_s, log_clocks),
         heights,
         found,
         origin,
+        world,
     )
+
+
+def _local_heights(records: Sequence[PhotoRecord]) -> datums.Heights:
+    values = tuple(record.local_m[2] if record.local_m else None for record in records)
+    return datums.Heights(values, LOCAL, LOCAL, "poses in a frame that is tied to no place on earth")
 
 
 def _check_unique(records: Sequence[PhotoRecord]) -> None:
@@ -115,12 +127,12 @@ def _check_unique(records: Sequence[PhotoRecord]) -> None:
 
 def _judged(record: PhotoRecord, height_m: float | None, heights: datums.Heights) -> PhotoRecord:
     """The record with its last reason to be left out: no height in the run's datum."""
-    if record.problem or height_m is not None:
+    if record.problem or height_m is not None or record.local_m is not None:
         return record
     own = datums.own_datum(record)
     has = f"its height is {own}" if own else "it has no height"
     remedy = "ingest it in a run of its own, or set ingest.height_datum" if own else "use the original file"
-    return replace(record, problem=f"the run's heights are {heights.datum}, {has}: {remedy}")
+    return replace(record, pose_problem=f"the run's heights are {heights.datum}, {has}: {remedy}")
 
 
 def _origin(records: Sequence[PhotoRecord], heights_m: Sequence[float | None]) -> LocalFrame | None:
@@ -142,11 +154,13 @@ def _origin(records: Sequence[PhotoRecord], heights_m: Sequence[float | None]) -
 
 def _positions(records: Sequence[PhotoRecord], heights_m: Sequence[float | None], origin: LocalFrame | None) -> Floats:
     """Camera centres in ENU, (n, 3), NaN where not known."""
+    if origin is None:
+        return np.array([record.local_m or (np.nan,) * 3 for record in records]).reshape(-1, 3)
     geodetic = np.full((len(records), 3), np.nan)
     for row, (record, height) in enumerate(zip(records, heights_m, strict=True)):
         if record.position is not None and height is not None:
             geodetic[row] = record.position.latitude_deg, record.position.longitude_deg, height
-    return geodetic * np.nan if origin is None else origin.enu_from_geodetic(*geodetic.T)
+    return origin.enu_from_geodetic(*geodetic.T)
 
 
 def _attitudes(records: Sequence[PhotoRecord], origin: LocalFrame | None) -> tuple[Floats, Floats]:
@@ -171,7 +185,8 @@ def _attitudes(records: Sequence[PhotoRecord], origin: LocalFrame | None) -> tup
 
 
 def _identity(record: PhotoRecord, camera_id: str, root: str, clock_offset_s: float) -> dict[str, Any]:
-    own_clock = record.time is not None and record.time_source != "mrk"
+    # Marks and logs have clocks of their own; the user's offset is for the camera's.
+    own_clock = record.time is not None and record.time_source != "mrk" and not record.time_source.startswith("log ")
     sources = [part.source for part in (record.position, record.attitude) if part is not None]
     return {
         "frame_id": record.frame_id,
@@ -192,7 +207,8 @@ def _identity(record: PhotoRecord, camera_id: str, root: str, clock_offset_s: fl
 def _sigmas(record: PhotoRecord, datum: str) -> dict[str, float]:
     if record.problem:
         return {}
-    sigmas = pose_sigmas(record.model, record.fix, datum)
+    logged = LOCAL_POSES if record.local_m else pose_sigmas(record.model, record.fix, datum)
+    sigmas = widened(logged, record.timing)
     return {
         **{f"sigma_{axis}_m": sigmas.position_m[k] for k, axis in enumerate(_AXES)},
         **{f"sigma_{angle}_deg": sigmas.attitude_deg[k] for k, angle in enumerate(_ANGLES)},
@@ -243,6 +259,7 @@ def _tracks(records: Sequence[PhotoRecord], marks: Sequence[MarkFile], root: str
             {
                 "source": relative_to(record.location, root),
                 "stream": "photo",
+                "what": "camera",
                 "time": record.time,
                 "latitude_deg": record.position.latitude_deg if record.position else None,
                 "longitude_deg": record.position.longitude_deg if record.position else None,
@@ -257,6 +274,7 @@ def _tracks(records: Sequence[PhotoRecord], marks: Sequence[MarkFile], root: str
         {
             "source": relative_to(file.location, root),
             "stream": "mrk",
+            "what": "camera",
             "time": mark.time,
             "latitude_deg": mark.latitude_deg,
             "longitude_deg": mark.longitude_deg,
@@ -269,9 +287,16 @@ def _tracks(records: Sequence[PhotoRecord], marks: Sequence[MarkFile], root: str
     return TRACKS.from_rows(rows)
 
 
-def _clocks(records: Sequence[PhotoRecord], found: Exposures, root: str, clock_offset_s: float) -> pa.Table:
-    """One row for the photos' clock, one per mark file."""
-    kinds = Counter(record.time_source for record in records if record.time is not None)
+def _clocks(
+    records: Sequence[PhotoRecord],
+    found: Exposures,
+    root: str,
+    clock_offset_s: float,
+    log_clocks: Sequence[Mapping[str, Any]],
+) -> pa.Table:
+    """One row for the photos' own clock, one per mark file, and those of the logs."""
+    own = [record for record in records if not record.time_source.startswith("log ")]
+    kinds = Counter(record.time_source for record in own if record.time is not None)
     source = min(kinds, key=lambda kind: (-kinds[kind], kind)) if kinds else ""
     unknown_zone = kinds["exif (zone unknown)"]
     said = f"{source}, read as UTC" if source == "exif (zone unknown)" else source
@@ -280,19 +305,20 @@ def _clocks(records: Sequence[PhotoRecord], found: Exposures, root: str, clock_o
         if unknown_zone and not clock_offset_s
         else ""
     )
-    rows: list[dict[str, Any]] = [
-        {
-            "clock_id": "photos",
-            "source": "photos",
-            "method": f"{said}, {clock_offset_s:+g} s stated by the user" if clock_offset_s else said or "no times",
-            "offset_s": clock_offset_s,
-            "sigma_s": _PHOTO_CLOCK_SIGMA_S if kinds and not unknown_zone else None,
-            "drift_ppm": 0.0,
-            "residual_s": None,
-            "anchors": 0,
-            "problem": problem,
-        }
-    ]
+    rows: list[dict[str, Any]] = [dict(row) for row in log_clocks]
+    photos: dict[str, Any] = {
+        "clock_id": "photos",
+        "source": "photos",
+        "method": f"{said}, {clock_offset_s:+g} s stated by the user" if clock_offset_s else said or "no times",
+        "offset_s": clock_offset_s,
+        "sigma_s": _PHOTO_CLOCK_SIGMA_S if kinds and not unknown_zone else None,
+        "drift_ppm": 0.0,
+        "residual_s": None,
+        "anchors": 0,
+        "problem": problem,
+    }
+    if own or not log_clocks:
+        rows.insert(0, photos)
     for location in sorted({*found.used, *found.problems}):
         offset_s = found.offset_s.get(location)
         beside = f"; photos are {-offset_s:+g} s from it" if offset_s is not None else ""

@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from pipeline.engine.errors import InputError
 from pipeline.sources import dji
+from pipeline.sources.accuracy import TimingSigmas
 from pipeline.sources.exif import Exif, read_exif
 from pipeline.sources.files import opened, stem
 from pipeline.sources.intrinsics import SourcedCamera, camera_of
@@ -55,9 +56,13 @@ class PhotoRecord:
         attitude: Gimbal attitude.
         absolute_m: AbsoluteAltitude, or EXIF's altitude, m, datum not known from the photo alone.
         relative_m: Height above the take-off point, m.
+        ellipsoidal_m: Height above the ellipsoid, where a log says so, m.
+        local_m: Camera centre in a frame tied to no place on earth, m, z up; then `attitude` is against that frame.
         fix: Quality of the position.
+        timing: What the error of the exposure's instant adds to the sigmas, where a log gave the pose.
         camera: Intrinsics at the file's size.
-        problem: Why it cannot be used, with the remedy; empty when it can.
+        image_problem: Why its pixels or lens cannot be used, with the remedy; empty when they can.
+        pose_problem: Why its own tags do not place it; a log may.
         notes: What to distrust although it can be used.
     """
 
@@ -74,10 +79,19 @@ class PhotoRecord:
     attitude: dji.Attitude | None = None
     absolute_m: float | None = None
     relative_m: float | None = None
+    ellipsoidal_m: float | None = None
+    local_m: tuple[float, float, float] | None = None
     fix: dji.Fix = field(default_factory=dji.Fix)
+    timing: TimingSigmas | None = None
     camera: SourcedCamera | None = None
-    problem: str = ""
+    image_problem: str = ""
+    pose_problem: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def problem(self) -> str:
+        """Why the photo cannot be used, with the remedy; empty when it can."""
+        return "; ".join(text for text in (self.image_problem, self.pose_problem) if text)
 
 
 def read_photo(location: str, calibration: SourcedCamera | None = None) -> PhotoRecord:
@@ -98,14 +112,14 @@ def read_photo(location: str, calibration: SourcedCamera | None = None) -> Photo
         data = stream.read(_MAX_BYTES + 1)
     name = stem(location)
     if not data:
-        return PhotoRecord(location, name, problem="the file is empty (0 bytes): copy it again from the card")
+        return PhotoRecord(location, name, image_problem="the file is empty (0 bytes): copy it again from the card")
     if len(data) > _MAX_BYTES:
-        return PhotoRecord(location, name, problem=f"the file has more than {_MAX_BYTES >> 20} MiB: not a photo")
+        return PhotoRecord(location, name, image_problem=f"the file has more than {_MAX_BYTES >> 20} MiB: not a photo")
     digest = hashlib.sha256(data).hexdigest()
     try:
         width, height, packet = _decoded(data)
     except dji.Unusable as error:
-        return PhotoRecord(location, name, digest, problem=str(error))
+        return PhotoRecord(location, name, digest, image_problem=str(error))
     notes: list[str] = []
     exif, xmp = _tags(data, packet, notes)
     return _record(
@@ -116,23 +130,24 @@ def read_photo(location: str, calibration: SourcedCamera | None = None) -> Photo
 def _record(
     base: PhotoRecord, exif: Exif, xmp: Xmp, calibration: SourcedCamera | None, notes: list[str]
 ) -> PhotoRecord:
-    problems = [text] if (text := dji.rewritten(exif, xmp)) else []
+    unusable = [text] if (text := dji.rewritten(exif, xmp)) else []
+    unplaced: list[str] = []
     time, time_source = dji.exposure_time(exif, xmp)
     position = attitude = camera = None
     try:
         position = dji.position(exif, xmp)
         notes.append(position.note)
     except dji.Unusable as error:
-        problems.append(str(error))
+        unplaced.append(str(error))
     try:
         attitude = dji.attitude(exif, xmp)
         notes.append(attitude.note)
     except dji.Unusable as error:
-        problems.append(str(error))
+        unplaced.append(str(error))
     try:
         camera = camera_of(exif, xmp, base.width, base.height, calibration)
     except dji.Unusable as error:
-        problems.append(str(error))
+        unusable.append(str(error))
     if exif.orientation not in {0, 1}:
         notes.append(f"EXIF orientation {exif.orientation}: pixels are used as they are stored")
     absolute = dji.number(xmp, "AbsoluteAltitude")
@@ -146,7 +161,8 @@ def _record(
         relative_m=dji.number(xmp, "RelativeAltitude"),
         fix=dji.fix(exif, xmp),
         camera=camera,
-        problem="; ".join(problems),
+        image_problem="; ".join(unusable),
+        pose_problem="; ".join(unplaced),
         notes=tuple(note for note in notes if note),
     )  # fmt: skip
 

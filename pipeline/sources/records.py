@@ -61,6 +61,7 @@ class Positions:
         sigma_vertical_m: (n,) one sigma, as logged; NaN where not logged.
         segment: (n,) changes wherever interpolation must not cross (an estimator's reset, a lost fix).
         fused: Whether it is a navigation filter's output, preferred to a bare receiver's.
+        image: (n,) names of the images that the rows belong to, `time_ns` then zeros; empty when they are of instants.
     """
 
     stream: str
@@ -75,6 +76,7 @@ class Positions:
     sigma_vertical_m: Floats
     segment: Ints
     fused: bool
+    image: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +91,7 @@ class Attitudes:
         frame: What it is measured against: "ned" (local north-east-down, true north); "heading" (level, x along the
             vehicle's heading: MAVLink's "vehicle frame"); "body" (the vehicle's FRD body, roll and pitch included).
         segment: (n,) as in `Positions`.
+        image: As in `Positions`.
     """
 
     stream: str
@@ -97,6 +100,7 @@ class Attitudes:
     of: Literal["vehicle", "gimbal"]
     frame: Literal["ned", "heading", "body"]
     segment: Ints
+    image: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +130,7 @@ class LocalPoses:
 
     Args:
         stream: The topic or file.
-        time_ns: (n,); empty where poses belong to named images instead.
+        time_ns: (n,); zeros where `image` names what the poses belong to.
         position_m: (n, 3) of the child's origin in the parent frame.
         q_wxyz: (n, 4) unit quaternions parent_from_child.
         parent: Name of the frame the poses are in ("map", "world"), empty when not named.
@@ -134,7 +138,7 @@ class LocalPoses:
         of: "camera" when the child is the camera itself (RDF); "body" when it is a vehicle or rigid body, which needs
             an extrinsic transform (from the bag or `ingest.mount`).
         axes: The body's axes: "flu" (ROS, REP 103), "frd" (aerospace); "rdf" for a camera.
-        image: Names of the images that the poses belong to; empty when they belong to instants.
+        image: (n,) names of the images that the poses belong to; empty when they belong to instants.
         segment: (n,) as in `Positions`.
     """
 

@@ -1,0 +1,208 @@
+"""Everything a flight left behind, read: photos, logs, bags, videos, and the images taken out of the latter two."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.clocks.fit import Nanoseconds
+from pipeline.engine.errors import InputError, UndeterminedError
+from pipeline.flight import RUN_IMAGES
+from pipeline.geometry.arrays import Ints
+from pipeline.placing.place import Stamp
+from pipeline.placing.pose import camera_poses
+from pipeline.placing.timeline import Timeline
+from pipeline.sources.files import find, is_url, stem
+from pipeline.sources.intrinsics import SourcedCamera
+from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES
+from pipeline.sources.photos import PhotoRecord
+from pipeline.sources.records import FlightLog, ImageStream
+from pipeline.tracks.mount import Mount
+from pipeline.tracks.spacing import spaced
+
+_FOLDERS = ("metadata.yaml", "cameras.bin", "cameras.txt")
+
+
+@dataclass(frozen=True, slots=True)
+class Extracted:
+    """An image taken out of a bag or video.
+
+    Args:
+        path: Where it was written.
+        line: The log it came out of, an index of the timelines.
+        log_ns: Its instant on that log's clock.
+        camera: Its calibration as the log has it; None when it has none.
+        note: What to distrust of its time.
+    """
+
+    path: Path
+    line: int
+    log_ns: int
+    camera: SourcedCamera | None
+    note: str
+
+
+def find_logs(names: str | Sequence[str] | None) -> list[str]:
+    """Logs and bags of a path, glob or list of these, sorted and each once.
+
+    A folder that is itself a log (a ROS 2 bag, a COLMAP model) stays one; any other is searched.
+
+    Args:
+        names: What the user names; None for nothing.
+
+    Returns:
+        Locations.
+
+    Raises:
+        InputError: A named path does not exist, or a folder holds no log.
+    """
+    listed = [] if names is None else [names] if isinstance(names, str) else list(names)
+    found: set[str] = set()
+    for name in listed:
+        if not is_url(name) and any((Path(name) / mark).is_file() for mark in _FOLDERS):
+            found.add(name)
+            continue
+        hits = find(name, (*LOG_SUFFIXES, *BAG_SUFFIXES))
+        if not hits:
+            raise InputError(
+                "E-LOG-02", "no log here", where=name, found="no file of a known kind",
+                expected=", ".join((*LOG_SUFFIXES, *BAG_SUFFIXES)),
+                hint="name the file itself if it has another ending",
+            )  # fmt: skip
+        found.update(hits)
+    return sorted(found)
+
+
+def files_of(locations: Sequence[str]) -> list[str]:
+    """The files whose bytes decide: those of a folder that is a log, or the log itself."""
+    out: list[str] = []
+    for location in locations:
+        folder = Path(location)
+        inside = not is_url(location) and folder.is_dir()
+        out += sorted(str(file) for file in folder.rglob("*") if file.is_file()) if inside else [location]
+    return out
+
+
+def image_stream(log: FlightLog, topic: str | None) -> ImageStream | None:
+    """The images of a bag: those of the named topic, else the longest stream.
+
+    Raises:
+        InputError: There are images, but none of that topic.
+    """
+    if topic is not None and log.images:
+        named = [stream for stream in log.images if stream.stream == topic]
+        if not named:
+            raise InputError(
+                "E-BAG-20", "the bag has no images of this topic", where=log.location, found=topic,
+                expected=", ".join(stream.stream for stream in log.images), hint="set ingest.image_topic",
+            )  # fmt: skip
+        return named[0]
+    return min(log.images, key=lambda s: (-len(s.time_ns), s.stream)) if log.images else None
+
+
+def calibration_of(log: FlightLog, frame: str) -> SourcedCamera | None:
+    """The calibration a log has for a camera's frame, or its only one; None when it has none."""
+    named = [camera for camera in log.cameras if frame and camera.frame == frame]
+    chosen = named or (list(log.cameras) if len(log.cameras) == 1 else [])
+    return SourcedCamera(chosen[0].camera, f"{log.kind} {chosen[0].stream}") if chosen else None
+
+
+def wanted(
+    number: int, lines: Sequence[Timeline], stream: ImageStream, mount: Mount, spacing_m: float, *, y_up: bool
+) -> Ints:
+    """Which images of a stream to use: one every `spacing_m` of the way, by whichever log knows where it was.
+
+    Args:
+        number: The log the images are in.
+        lines: All logs.
+        stream: The images.
+        mount: The camera on the vehicle.
+        spacing_m: Way between two images, m.
+        y_up: Whether the y axis of a local frame points up.
+
+    Returns:
+        Indices of the stream.
+
+    Raises:
+        UndeterminedError: No log says where any of the images was taken.
+    """
+    own = lines[number]
+    others = [line for line in lines if line is not own and line.clock is not None and own.clock is not None]
+    for line in [own, *others]:
+        if line.places:
+            centres = camera_poses(line, on_clock_of(line, own, stream.time_ns), mount, y_up=y_up).centre_m
+            chosen = spaced(centres, spacing_m)
+            if len(chosen):
+                return chosen
+    raise UndeterminedError(
+        "E-BAG-21",
+        "nothing says where the images were taken",
+        where=own.log.location,
+        found=f"{len(stream.time_ns)} images of {stream.stream}, and no positions at their times",
+        expected="poses in the same file (topics of poses or GNSS fixes; an .SRT beside a video), or a log with UTC",
+        hint="name the poses' topic (ingest.pose_topic) or their log (ingest.logs)",
+    )
+
+
+def on_clock_of(line: Timeline, own: Timeline, time_ns: Nanoseconds) -> Nanoseconds:
+    """Instants of one log's clock on another's, by way of UTC."""
+    if line is own:
+        return time_ns
+    utc_ns = own.utc_ns(time_ns)
+    if line.clock is None:
+        return utc_ns
+    guess = utc_ns - line.clock.offset_ns
+    return guess - (line.clock.apply(guess) - utc_ns)
+
+
+def as_photo(record: PhotoRecord, image: Extracted, line: Timeline) -> PhotoRecord:
+    """The record of an image that was taken out of a log: named by its place in the run, timed by the log."""
+    time = None
+    if line.clock is not None:
+        utc_ns = int(line.utc_ns(np.array([image.log_ns], np.int64))[0])
+        time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns / 1000)
+    notes = (*record.notes, image.note) if image.note else record.notes
+    return replace(
+        record,
+        location=f"{RUN_IMAGES}{image.path.name}",
+        time=time,
+        time_source="header stamp" if time is not None else "",
+        notes=notes,
+    )
+
+
+def stamp_of(image: Extracted) -> tuple[str, Stamp]:
+    """An extracted image's name in the run, and its instant."""
+    return f"{RUN_IMAGES}{image.path.name}", Stamp(image.line, image.log_ns)
+
+
+def file_name(location: str, index: int, suffix: str) -> str:
+    """The name of an image taken out of a bag or video: the source's, and its number in the stream."""
+    name = Path(location).name if not is_url(location) and Path(location).is_dir() else stem(location)
+    return f"{name}_{index:06d}{suffix}"
+
+
+def write_images(
+    folder: Path, location: str, indices: Ints, times_ns: Nanoseconds, images: Iterator[tuple[int, bytes, str]]
+) -> Iterator[tuple[Path, int]]:
+    """Writes images as they come out of their source.
+
+    Args:
+        folder: Where.
+        location: The source.
+        indices: (k,) numbers of the images in their stream.
+        times_ns: (k,) their instants.
+        images: Instant, file bytes and suffix of each.
+
+    Yields:
+        Path and instant of each image written.
+    """
+    number_of = {int(time): int(index) for time, index in zip(times_ns, indices, strict=True)}
+    for time_ns, data, suffix in images:
+        path = folder / file_name(location, number_of[time_ns], suffix)
+        path.write_bytes(data)
+        yield path, time_ns

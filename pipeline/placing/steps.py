@@ -1,0 +1,247 @@
+"""The steps of ingest: logs as timelines, images out of bags, photos read and placed, sweeps as tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pipeline.engine.errors import UndeterminedError
+from pipeline.engine.stage import Context
+from pipeline.geodesy.enu import LocalFrame
+from pipeline.geometry.arrays import Ints
+from pipeline.lidar.sweeps import write_sweeps
+from pipeline.placing.gather import Extracted, as_photo, calibration_of, image_stream, stamp_of, wanted, write_images
+from pipeline.placing.place import Placed, place
+from pipeline.placing.sensors import sensor_poses
+from pipeline.placing.timeline import Timeline, timeline
+from pipeline.sources.bag_payloads import read_images, read_sweeps
+from pipeline.sources.calibration import read_calibration
+from pipeline.sources.exposures import MarkFile
+from pipeline.sources.files import MARK_SUFFIXES, beside, opened
+from pipeline.sources.intrinsics import SourcedCamera
+from pipeline.sources.logs import read_log
+from pipeline.sources.mrk import read_marks
+from pipeline.sources.photos import PhotoRecord, read_photo
+from pipeline.sources.records import ImageStream
+from pipeline.sources.video import describe_video, read_frames, srt_beside
+from pipeline.tracks.mount import Mount
+
+_SHARD = 32
+_IMAGES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Wishes:
+    """What the user says that files do not.
+
+    Args:
+        camera: Calibration file of all images; None for what they or their logs say.
+        mount: The camera on the vehicle.
+        lidar_mount: The LiDAR on what is posed; None to find it in the bag.
+        pose_topic: Topic of local poses; None for the longest.
+        image_topic: Topic of images; None for the longest.
+        y_up: Whether the y axis of a local frame points up.
+        spacing_m: Way between two images taken out of a bag or video.
+        clock_offset_s: What makes the photos' times UTC; None to find out.
+    """
+
+    camera: str | None
+    mount: Mount
+    lidar_mount: Mount | None
+    pose_topic: str | None
+    image_topic: str | None
+    y_up: bool
+    spacing_m: float
+    clock_offset_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A log and how its images are used.
+
+    Args:
+        line: What the log says.
+        images: The stream of images that is used; None for none.
+        video: The video that the stream is in; empty when it is the log itself.
+    """
+
+    line: Timeline
+    images: ImageStream | None = None
+    video: str = ""
+
+
+def read_sources(
+    context: Context, logs: Sequence[str], bags: Sequence[str], videos: Sequence[str], wishes: Wishes
+) -> list[Source]:
+    """Reads logs, then bags with their images, then videos with their subtitles.
+
+    Args:
+        context: For progress.
+        logs: Logs whose images, if any, are not used.
+        bags: Bags whose images are used.
+        videos: Videos.
+        wishes: What the user says.
+
+    Returns:
+        The sources in that order.
+    """
+    jobs = [("log", name) for name in logs] + [("bag", name) for name in bags] + [("video", name) for name in videos]
+    read = partial(_read_sources, wishes)
+    return [source for part in context.map(read, jobs, shard=1, label="logs") for source in part]
+
+
+def _read_sources(wishes: Wishes, jobs: Sequence[tuple[str, str]]) -> list[Source]:
+    out = []
+    for kind, name in jobs:
+        if kind == "video":
+            out.append(Source(timeline(read_log(_subtitles(name))), describe_video(name)[0], name))
+            continue
+        log = read_log(name)
+        stream = image_stream(log, wishes.image_topic) if kind == "bag" else None
+        out.append(Source(timeline(log, wishes.pose_topic, stream.frame if stream else None), stream))
+    return out
+
+
+def _subtitles(video: str) -> str:
+    beside_it = srt_beside(video)
+    if beside_it is None:
+        raise UndeterminedError(
+            "E-VIDEO-10", "nothing says where the video's frames were taken", where=video,
+            found="no .SRT beside it", expected="the drone's subtitles, of the same name",
+            hint="copy the .SRT from the card too (in DJI's app: video captions on)",
+        )  # fmt: skip
+    return beside_it
+
+
+def extract(context: Context, sources: Sequence[Source], wishes: Wishes) -> list[Extracted]:
+    """Takes the images that are used out of bags and videos, into the run folder's `images`.
+
+    Args:
+        context: For the output folder and progress.
+        sources: What was read.
+        wishes: What the user says.
+
+    Returns:
+        The images, in order of source and time.
+
+    Raises:
+        UndeterminedError: Nothing says where any image of a source was taken.
+    """
+    folder = context.output("images")
+    lines = [source.line for source in sources]
+    jobs = []
+    for number, source in enumerate(sources):
+        if source.images is not None:
+            chosen = wanted(number, lines, source.images, wishes.mount, wishes.spacing_m, y_up=wishes.y_up)
+            # Pieces of a stream are read side by side; each is some hundred images, so that seeking to it pays.
+            jobs += [(number, source, chosen[begin : begin + _IMAGES]) for begin in range(0, len(chosen), _IMAGES)]
+    take = partial(_take, folder, wishes)
+    return [image for part in context.map(take, jobs, shard=1, label="bags") for image in part]
+
+
+def _take(folder: Path, wishes: Wishes, jobs: Sequence[tuple[int, Source, Ints]]) -> list[Extracted]:
+    out = []
+    for number, source, chosen in jobs:
+        stream, log = source.images, source.line.log
+        if stream is None:
+            continue
+        times_ns = stream.time_ns[chosen]
+        location = source.video or log.location
+        images = (
+            read_frames(location, times_ns) if source.video else read_images(location, stream.stream, times_ns.tolist())
+        )
+        camera = None if wishes.camera else calibration_of(log, stream.frame)
+        for path, time_ns in write_images(folder, location, chosen, times_ns, images):
+            out.append(Extracted(path, number, time_ns, camera, stream.note))
+    return sorted(out, key=lambda image: image.log_ns)
+
+
+def read_photos(
+    context: Context, photos: Sequence[str], images: Sequence[Extracted], sources: Sequence[Source], wishes: Wishes
+) -> list[PhotoRecord]:
+    """Reads photos and extracted images.
+
+    Args:
+        context: For progress.
+        photos: Locations of photos.
+        images: Images out of bags and videos.
+        sources: What was read of logs.
+        wishes: What the user says.
+
+    Returns:
+        Records, photos first.
+    """
+    stated = read_calibration(wishes.camera) if wishes.camera else None
+    logged = [calibration_of(source.line.log, "") for source in sources if not source.images]
+    of_photos = stated or next((camera for camera in logged if camera is not None), None)
+    jobs = [(name, of_photos) for name in photos] + [(str(image.path), stated or image.camera) for image in images]
+    records = [record for part in context.map(_read, jobs, shard=_SHARD, label="photos") for record in part]
+    taken = zip(records[len(photos) :], images, strict=True)
+    return [*records[: len(photos)], *(as_photo(record, image, sources[image.line].line) for record, image in taken)]
+
+
+def _read(jobs: Sequence[tuple[str, SourcedCamera | None]]) -> list[PhotoRecord]:
+    return [read_photo(location, camera) for location, camera in jobs]
+
+
+def placed(
+    records: Sequence[PhotoRecord], images: Sequence[Extracted], sources: Sequence[Source], wishes: Wishes
+) -> Placed:
+    """Photos and images where the logs say the camera was."""
+    return place(
+        records,
+        [source.line for source in sources],
+        dict(stamp_of(image) for image in images),
+        wishes.mount,
+        clock_offset_s=wishes.clock_offset_s,
+        y_up=wishes.y_up,
+    )
+
+
+def exposure_marks(photos: Sequence[str]) -> tuple[list[MarkFile], list[str]]:
+    """The exposure marks beside photos, and those that are empty.
+
+    A damaged file stops the run: poses would silently be metres worse.
+
+    Args:
+        photos: Locations of photos.
+
+    Returns:
+        The files that hold marks, and a sentence for each that holds none.
+    """
+    files, empty = [], []
+    for location in beside(photos, MARK_SUFFIXES):
+        with opened(location) as stream:
+            data = stream.read()
+        if data.strip(b"\x00 \t\r\n"):
+            files.append(MarkFile(location, tuple(read_marks(data, location))))
+        else:
+            # Drones without a base station write the file and leave it empty.
+            empty.append(f"{location} is empty")
+    return files, empty
+
+
+def write_sweeps_of(context: Context, sources: Sequence[Source], origin: LocalFrame | None, wishes: Wishes) -> int:
+    """LiDAR sweeps of bags as tiles in the run's frame, in `sweeps`.
+
+    Args:
+        context: For the output folder.
+        sources: What was read.
+        origin: The run's ENU frame; None in a local frame.
+        wishes: What the user says.
+
+    Returns:
+        Points written.
+    """
+    written = 0
+    for number, source in enumerate(sources):
+        log = source.line.log
+        if source.images is None or not log.sweeps or not source.line.places:
+            continue
+        stream = max(log.sweeps, key=lambda sweeps: sweeps.points)
+        poses = sensor_poses(source.line, stream, wishes.lidar_mount, origin, y_up=wishes.y_up)
+        folder = context.output("sweeps") / f"bag-{number:02d}"
+        written += write_sweeps(read_sweeps(log.location, stream.stream), poses, folder)
+    return written

@@ -206,7 +206,7 @@ def local_context(folder: Path, **changes: Any) -> FakeContext:
 
 def sweep_ground(folder: Path, points: np.ndarray | None = None) -> int:
     seen = (ground() if points is None else points) - (0.0, 0.0, 1.5)
-    return write_sweeps([Sweep(0, seen, np.zeros(len(seen)))], still, folder / "sweeps", max_range_m=200.0)
+    return write_sweeps([Sweep(0, seen, np.zeros(len(seen)))], still, folder / "sweeps" / "bag-00", max_range_m=200.0)
 
 
 @pytest.mark.parametrize("wkt", [None, LOCAL_WKT, LOCAL.to_wkt("WKT1_GDAL"), 'LOCAL_CS["mine",UNIT["metre",1]]'])

@@ -19,9 +19,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeline.engine.errors import UsageError
 from pipeline.geometry.cameras import Camera
+from pipeline.lidar.nearby import LocalTiles, returns_near
+from pipeline.lidar.reference import reference_depth
+from pipeline.lidar.spacing import surface_spacing_m
+from pipeline.lidar.sweeps import write_sweeps
+from pipeline.lidar.tiles import read_local_tile
+from pipeline.lidar.visibility import View, visible_returns
 from pipeline.simulation import indoor as module
 from pipeline.simulation.indoor import Summary, write_indoor
 from pipeline.simulation.indoor_room import Room
+from pipeline.sources.records import Sweep
 
 FRAMES = 6
 # y up to z up, by hand: x stays, the mocap's y is up, its z points south.
@@ -299,6 +306,38 @@ def test_the_whole_scan_lies_on_the_room_and_what_is_in_it(body: Body, bag: dict
     near = to_walls[on_walls]
     # The noise is along the ray, which meets walls aslant.
     assert 0.004 < np.median(near) < 0.02
+
+
+def test_depths_from_the_sweeps_are_the_exact_ones_also_beside_what_stands_in_the_way(
+    truth: Truth, body: Body, bag: dict[str, list[Any]], tmp_path: Path
+) -> None:
+    sweeps = (
+        Sweep(
+            stamp(sweep), np.column_stack([points[axis] for axis in "xyz"]).astype(float), points["time"].astype(float)
+        )
+        for sweep in bag["/velodyne_points"]
+        for points in (points_of(sweep),)
+    )
+    written = write_sweeps(sweeps, lambda instants: body.of("velodyne", instants), tmp_path)
+    assert 120_000 < written < 250_000
+    tiles = LocalTiles(tuple(read_local_tile(path) for path in sorted(tmp_path.glob("*.laz"))))
+    returns = returns_near(tiles, truth.centre, 15.0)
+    spacing = surface_spacing_m(returns)
+    # By their noise walls are often two voxels thick.
+    assert 0.03 < spacing < 0.06
+    rng = np.random.default_rng(0)
+    for index in range(FRAMES):
+        view = View(truth.camera, truth.centre[index], truth.rotation[index])
+        visible = visible_returns(view, returns, None, spacing, 15.0)
+        pixels = rng.integers((0, 0), (640, 480), (4000, 2)).astype(float)
+        ideal, around = (430.0 * truth.camera.rays(px)[:, :2] for px in (pixels, visible.pixels))
+        found = reference_depth(pixels, ideal, visible, around)
+        # Rings from -15 to 15 deg leave the floor at the camera's feet and the ceiling without returns.
+        assert 0.4 < np.mean(found.valid) < 0.9
+        at = pixels[found.valid].astype(int)
+        off = np.abs(found.depth_m[found.valid] - truth.depth[index][at[:, 1], at[:, 0]])
+        assert 0.001 < np.median(off) < 0.01
+        assert np.mean(off > 0.1) < 0.02
 
 
 # ---- the folder

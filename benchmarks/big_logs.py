@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.writer import CompressionType
+from mcap_protobuf.writer import Writer
 
 from pipeline.geometry.arrays import AnyArray, Bytes, Ints
 from pipeline.simulation.logs.dataflash import MESSAGES, records
@@ -25,6 +35,12 @@ _GROWS = {
     ("GPS", "GMS"): 1000, ("GPA", "SMS"): 1000, ("CAM", "GPSTime"): 1000, ("CAM", "Img"): 1,
     ("GPS", "Lat"): 719, ("POS", "Lat"): 719, ("CAM", "Lat"): 719,
 }  # fmt: skip
+
+# Messages per second of a bag with a camera and a LiDAR, and the sizes of their payloads.
+_BAG_HZ = {"/pose": 200, "/fix": 10, "/camera/image": 10, "/lidar/points": 10}
+_IMAGE_BYTES, _SWEEP_POINTS, _POINT_BYTES = 500_000, 30_000, 16
+_BAG_BEGAN_NS = 1_700_000_000_000_000_000
+_FLOAT32 = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +77,46 @@ def write_dataflash(path: Path, size_bytes: int) -> None:
                 numbers.write(block, seconds)
             stream.write(block.tobytes())
             begun += len(seconds)
+
+
+def write_mcap(path: Path, size_bytes: int, compression: str = "none") -> None:
+    """Writes an MCAP file of at least so many bytes in Foxglove's schemas: images, sweeps, positions and poses.
+
+    Args:
+        path: Where.
+        size_bytes: How big; up to a second more is written.
+        compression: Of its chunks: "none", "lz4" or "zstd".
+    """
+    with path.open("wb") as stream, Writer(stream, compression=CompressionType[compression.upper()]) as writer:
+        messages = _bag_messages()
+        while stream.tell() < size_bytes:
+            for time_ns, topic, message in islice(messages, sum(_BAG_HZ.values())):
+                writer.write_message(topic, message, time_ns, time_ns)
+
+
+def _bag_messages() -> Iterator[tuple[int, str, Any]]:
+    """Messages without end, a second's in the order of time."""
+    rng = np.random.default_rng(7)
+    sweep = PointCloud(frame_id="lidar", point_stride=_POINT_BYTES, data=rng.bytes(_SWEEP_POINTS * _POINT_BYTES))
+    for offset, name in enumerate(("x", "y", "z", "intensity")):
+        sweep.fields.add(name=name, offset=4 * offset, type=_FLOAT32)
+    pose = PoseInFrame(frame_id="map")
+    pose.pose.orientation.w = 1.0
+    made: dict[str, Any] = {
+        "/pose": pose,
+        "/fix": LocationFix(latitude=48.0, longitude=11.0, altitude=520.0, position_covariance_type=2),
+        "/camera/image": CompressedImage(frame_id="camera", data=rng.bytes(_IMAGE_BYTES), format="jpeg"),
+        "/lidar/points": sweep,
+    }
+    made["/fix"].position_covariance[:] = [0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.04]
+    instants = [(n * 1_000_000_000 // hz, topic) for topic, hz in _BAG_HZ.items() for n in range(hz)]
+    begun_ns = _BAG_BEGAN_NS
+    while True:
+        for after_ns, topic in sorted(instants):
+            seconds, nanoseconds = divmod(begun_ns + after_ns, 1_000_000_000)
+            made[topic].timestamp.CopyFrom(Timestamp(seconds=seconds, nanos=nanoseconds))
+            yield begun_ns + after_ns, topic, made[topic]
+        begun_ns += 1_000_000_000
 
 
 def _format(name: str, kind: int, letters: str, fields: str) -> bytes:

@@ -95,13 +95,14 @@ class Bag(ABC):
         return self._span_ns
 
 
-def decompressed(data: Raw, compression: str, size: int) -> Raw:
+def decompressed(data: Raw, compression: str, size: int, *, whole: bool = True) -> Raw:
     """A chunk's content.
 
     Args:
         data: As it stands in the file.
         compression: "" or "none", "lz4" (frame format), "zstd", "bz2".
         size: Of the content, bytes, as the file says: nothing larger is made of it.
+        whole: Whether all of the data are there; of a chunk that was cut off, the beginning comes.
 
     Raises:
         DamagedError: It cannot be decompressed, or the size is wrong, or the compression is not known.
@@ -116,14 +117,14 @@ def decompressed(data: Raw, compression: str, size: int) -> Raw:
 
             out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
         elif compression == "zstd":
-            out = zstd(data, size)
+            out = zstd(data, size) if whole else _zstd_beginning(data, size)
         elif compression == "bz2":
             out = bz2.BZ2Decompressor().decompress(data, max_length=size)
         else:
             raise DamagedError(f"compression {compression!r}, which is not known")
     except (RuntimeError, OSError, EOFError, MemoryError) as error:
         raise DamagedError(f"{compression}: {error}") from error
-    if len(out) != size:
+    if len(out) != size and whole:
         raise DamagedError(f"{len(out)} of {size} bytes after {compression}")
     return out
 
@@ -141,6 +142,15 @@ def zstd(data: Raw, limit: int = MAX_RECORD_BYTES) -> bytes:
         if stated not in {zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR} and stated > limit:
             raise DamagedError(f"a zstd frame of {stated} bytes where {limit} are expected")
         return zstandard.ZstdDecompressor().decompress(bytes(data), max_output_size=limit)
+    except zstandard.ZstdError as error:
+        raise DamagedError(f"zstd: {error}") from error
+
+
+def _zstd_beginning(data: Raw, limit: int) -> bytes:
+    import zstandard  # noqa: PLC0415 - only where it is needed
+
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(limit)
     except zstandard.ZstdError as error:
         raise DamagedError(f"zstd: {error}") from error
 

@@ -65,7 +65,7 @@ class BagMessages:
     Args:
         fixes: By topic: latitude, longitude, altitude, sigmas, and how many fixes had been lost before.
         lost_fixes: Fixes without a position, by topic.
-        attitudes: By topic: quaternions.
+        attitudes: By topic and frame of the sensor: quaternions.
         poses: By topic, parent and child: position and quaternion.
         edges: Of transform trees, by topic, parent and child: translation and quaternion.
         static: Of latched transform trees, by topic, parent and child.
@@ -78,7 +78,7 @@ class BagMessages:
 
     fixes: dict[str, Samples] = field(default_factory=dict)
     lost_fixes: Counter[str] = field(default_factory=Counter)
-    attitudes: dict[str, Samples] = field(default_factory=dict)
+    attitudes: dict[tuple[str, str], Samples] = field(default_factory=dict)
     poses: dict[Edge, Samples] = field(default_factory=dict)
     edges: dict[Edge, Samples] = field(default_factory=dict)
     static: dict[Edge, tuple[float, ...]] = field(default_factory=dict)
@@ -103,8 +103,8 @@ class BagMessages:
 
     def streams(self) -> list[Samples]:
         """All columns that have times."""
-        columns = (self.fixes, self.attitudes, self.triggers, self.poses, self.edges)
-        out = [samples for held in columns for samples in held.values()]
+        out = [*self.fixes.values(), *self.attitudes.values(), *self.poses.values(), *self.edges.values()]
+        out += self.triggers.values()
         out += [payloads.samples for payloads in (*self.images.values(), *self.sweeps.values())]
         return out + [calibration.samples for calibration in self.calibrations.values()]
 
@@ -179,7 +179,8 @@ def _fix(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
 def _imu(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
     # A driver without an orientation says so by a covariance of -1 (sensor_msgs/Imu).
     if float(message.orientation_covariance[0]) != -1.0:
-        to.attitudes.setdefault(topic, Samples(4)).add(stamp_ns(message), log_ns, _wxyz(message.orientation))
+        samples = to.attitudes.setdefault((topic, frame_of(message)), Samples(4))
+        samples.add(stamp_ns(message), log_ns, _wxyz(message.orientation))
 
 
 def _pose(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.sources.bag_columns import Samples, Timed, epoch_of, timed
 from pipeline.sources.bag_messages import BagMessages, Calibration, Edge
+from pipeline.sources.frame_tree import transform_between
 from pipeline.sources.records import (
     Attitudes,
     Events,
@@ -30,11 +33,13 @@ _REPORTED_SIGMA_S, _TRIGGERED_SIGMA_S = 0.001, 0.01
 _NED_FROM_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 _FLU_FROM_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 _STILL = 2
+# The body's own frame (REP 105): an IMU may be mounted any way in it.
+_BODY = "base_link"
 
 
 @dataclass(frozen=True, slots=True)
 class BagContent:
-    """The records of a bag; fields as in `FlightLog`."""
+    """The records of a bag; fields as in `FlightLog`. Among the facts are the frames that the attitudes are of."""
 
     time_base: TimeBase
     positions: tuple[Positions, ...]
@@ -46,6 +51,7 @@ class BagContent:
     cameras: tuple[LoggedCamera, ...]
     sweeps: tuple[SweepStream, ...]
     losses: tuple[str, ...]
+    facts: Mapping[str, Any]
 
 
 def records_of(messages: BagMessages) -> BagContent:
@@ -68,6 +74,7 @@ class _Maker:
     def __init__(self, messages: BagMessages) -> None:
         self._of = messages
         self._losses: list[str] = []
+        self._attitude_frames: dict[str, str] = {}
         self._epoch = epoch_of(messages.streams())
 
     def content(self) -> BagContent:
@@ -75,18 +82,19 @@ class _Maker:
         poses = [self._poses(key, samples, key[0]) for key, samples in self._of.poses.items()]
         edges = [self._poses(key, rows, f"{key[0]} {key[1]}>{key[2]}") for key, rows in self._of.edges.items()]
         transforms = self._transforms()
-        images, sweeps, cameras, events = self._images(), self._sweeps(), self._cameras(), self._events()
+        attitudes, cameras, events = self._attitudes(transforms), self._cameras(), self._events()
         return BagContent(
             time_base=self._time_base(),
             positions=tuple(stream for stream in positions if len(stream.time_ns)),
-            attitudes=self._attitudes(),
+            attitudes=attitudes,
             events=events,
             poses=tuple(stream for stream in (*poses, *edges) if len(stream.time_ns)),
             transforms=transforms,
-            images=images,
+            images=self._images(),
             cameras=cameras,
-            sweeps=sweeps,
+            sweeps=self._sweeps(),
             losses=tuple(self._losses),
+            facts={"attitude_frames": self._attitude_frames} if self._attitude_frames else {},
         )
 
     def _time_base(self) -> TimeBase:
@@ -136,13 +144,18 @@ class _Maker:
         q_wxyz = found.values[:, first:]
         return found, q_wxyz / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
 
-    def _attitudes(self) -> tuple[Attitudes, ...]:
+    def _attitudes(self, transforms: tuple[FixedTransform, ...]) -> tuple[Attitudes, ...]:
+        """Attitudes of the body where the bag says how the sensor is mounted on it, else of the sensor."""
         out = []
-        for topic, samples in self._of.attitudes.items():
-            found, q_wxyz = self._rotations(topic, samples, 0)
-            if len(found.time_ns):
-                ned = _product(_product(_NED_FROM_ENU, q_wxyz), _FLU_FROM_FRD)
-                out.append(Attitudes(topic, found.time_ns, ned, "vehicle", "ned", segments(found.time_ns)))
+        for (topic, frame), samples in self._of.attitudes.items():
+            found, enu_from_sensor = self._rotations(topic, samples, 0)
+            if not len(found.time_ns):
+                continue
+            mount = transform_between(transforms, frame, _BODY)
+            enu = enu_from_sensor if mount is None else _product(enu_from_sensor, mount[1])
+            ned = _product(_product(_NED_FROM_ENU, enu), _FLU_FROM_FRD)
+            out.append(Attitudes(topic, found.time_ns, ned, "vehicle", "ned", segments(found.time_ns)))
+            self._attitude_frames[topic] = frame if mount is None else _BODY
         return tuple(out)
 
     def _poses(self, key: Edge, samples: Samples, stream: str) -> LocalPoses:

@@ -29,7 +29,7 @@ class VideoDecoder:
         import av  # noqa: PLC0415 - heavy
 
         name = _CODECS.get(form.strip().lower())
-        if name is None:
+        if name not in av.codecs_available:
             raise UnknownEncodingError(form, ", ".join(_CODECS))
         self._av = av
         self._context: Any = av.CodecContext.create(name, "r")

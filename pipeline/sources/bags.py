@@ -112,7 +112,8 @@ def read_bag(location: str) -> FlightLog:
     if not bag.counted.total():
         raise unreadable(location, "; ".join(bag.losses) or "no message", "a bag with messages")
     content = records_of(messages)
-    facts: dict[str, Any] = {**bag.facts, "duration_s": bag.duration_s, "topics": dict(sorted(bag.types.items()))}
+    topics = dict(sorted(bag.types.items()))
+    facts: dict[str, Any] = {**bag.facts, "duration_s": bag.duration_s, "topics": topics, **content.facts}
     return FlightLog(
         location=location,
         kind=bag.kind,

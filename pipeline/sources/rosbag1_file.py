@@ -22,7 +22,7 @@ from pipeline.sources.records import NS_PER_S
 
 MAGIC = b"#ROSBAG V"
 _VERSION = b"#ROSBAG V2.0\n"
-_MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
+_MESSAGE, _BAG_HEADER, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAX_HEADER_BYTES = 1 << 20
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
@@ -47,6 +47,7 @@ class Rosbag1(Bag):
         super().__init__("ROS 1 bag")
         self._stream = stream
         self._topics: dict[int, Topic] = {}
+        self._chunks: list[int] = []
         self._wanted: dict[int, bool] = {}
         self._strangers = 0
         self._compressions: set[str] = set()
@@ -68,10 +69,10 @@ class Rosbag1(Bag):
 
     def messages(self, wanted: Wanted) -> Iterator[Message]:
         """As `Bag.messages`."""
-        for fields, data in self._records(len(_VERSION)):
+        for fields, data, whole in self._records(len(_VERSION)):
             op = _op(fields)
             if op == _CHUNK:
-                yield from self._chunk(fields, data, wanted)
+                yield from self._chunk(fields, data, wanted, whole=whole)
             else:
                 yield from self._record(op, fields, data, wanted)
         if self._strangers:
@@ -80,7 +81,7 @@ class Rosbag1(Bag):
 
     def _first_header(self, where: str) -> _Fields:
         """The bag header, which is padded so that it can be rewritten when the bag is closed."""
-        for fields, _ in self._records(len(_VERSION)):
+        for fields, _, _ in self._records(len(_VERSION)):
             if fields.get(b"encryptor"):
                 raise unreadable(where, "an encrypted bag", "a plain bag", "rosbag decrypt")
             if _op(fields) == _BAG_HEADER:
@@ -90,23 +91,30 @@ class Rosbag1(Bag):
         raise unreadable(where, "no bag header", "a ROS 1 bag", "rosbag reindex, or copy the file again")
 
     def _read_index(self) -> None:
-        """Connections, which the index repeats: the chunk that introduced one may be damaged."""
-        for fields, data in self._records(self._index_at):
-            if _op(fields) != _CONNECTION:
-                break
-            self._connection(fields, data)
+        """Connections, whose first description may be damaged, and where chunks begin."""
+        for fields, data, _ in self._records(self._index_at):
+            if _op(fields) == _CONNECTION:
+                self._connection(fields, data)
+            elif _op(fields) == _CHUNK_INFO:
+                self._chunks.append(int.from_bytes(fields.get(b"chunk_pos", b""), "little"))
+        self._chunks.sort()
         # What is wrong here is told when the whole is read.
         self.losses.clear()
 
-    def _records(self, at: int) -> Iterator[tuple[_Fields, Raw]]:
-        """Records of the file; data only of the kinds that are read."""
+    def _records(self, at: int) -> Iterator[tuple[_Fields, Raw, bool]]:
+        """Records of the file, their data only of the kinds that are read, and whether those are whole."""
         while at < self._size:
+            after = next((place for place in self._chunks if at < place < self._size), self._size)
             try:
                 fields, begin, length = self._header(at)
                 op = _op(fields)
+                whole = begin + length <= self._size
+                if not whole and after < self._size:
+                    raise DamagedError(f"a record of {length} bytes")  # noqa: TRY301 - one way to tell it
             except DamagedError as error:
-                self._ended(at, str(error))
-                return
+                self.losses.append(f"{after - at} bytes from byte {at} on could not be read: {error}")
+                at = after
+                continue
             at = begin + length
             data = b""
             if op in {_CHUNK, _MESSAGE, _CONNECTION} and length <= MAX_RECORD_BYTES:
@@ -114,15 +122,9 @@ class Rosbag1(Bag):
             elif op in {_CHUNK, _MESSAGE, _CONNECTION}:
                 self.losses.append(f"a record of {length} bytes at byte {begin} is left out")
                 continue
-            yield fields, data
-            if at > self._size:
-                self._ended(begin, f"a record of {length} bytes where {self._size - begin} are left")
-                return
-            self._stream.seek(at)
-
-    def _ended(self, at: int, why: str) -> None:
-        left = self._size - at
-        self.losses.append(f"nothing could be read after byte {at} ({left} bytes, {left / self._size:.1%}): {why}")
+            if not whole:
+                self.losses.append(f"the file ends within a record of {length} bytes, of which {len(data)} are there")
+            yield fields, data, whole
 
     def _header(self, at: int) -> tuple[_Fields, int, int]:
         """Header fields of a record, where its data begin, and their length."""
@@ -134,11 +136,12 @@ class Rosbag1(Bag):
         fields = _fields(header)
         return fields, at + 8 + length, _u32(self._stream.read(4))
 
-    def _chunk(self, fields: _Fields, data: Raw, wanted: Wanted) -> Iterator[Message]:
+    def _chunk(self, fields: _Fields, data: Raw, wanted: Wanted, *, whole: bool) -> Iterator[Message]:
         compression = fields.get(b"compression", b"none").decode("ascii", "replace")
         self._compressions.add(compression)
         try:
-            content = memoryview(decompressed(data, compression, _u32(fields.get(b"size", b""))))
+            size = _u32(fields.get(b"size", b""))
+            content = memoryview(decompressed(data, compression, size, whole=whole))
             for inner, message in _inside(content):
                 yield from self._record(_op(inner), inner, message, wanted)
         except DamagedError as error:

@@ -49,21 +49,24 @@ class Db3File(Bag):
 
     def messages(self, wanted: Wanted) -> Iterator[Message]:
         """As `Bag.messages`."""
-        numbers = [number for number, topic in self._topics.items() if wanted(topic)]
+        numbers = {number for number, topic in self._topics.items() if wanted(topic)}
         strangers = 0
         try:
             with closing(self._connected()) as database:
-                self._count(database)
-                places = ",".join("?" * len(numbers))
-                rows = database.execute(
-                    f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})",  # noqa: S608 - question marks only
-                    numbers,
-                )
+                counted = self._count(database)
+                # What cannot be counted at once is counted row by row, wanted or not.
+                asked = numbers if counted else set(self._topics)
+                places = ",".join("?" * len(asked))
+                query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"  # noqa: S608
+                rows = database.execute(query, sorted(asked))
                 for number, log_ns, data in rows:
-                    if isinstance(log_ns, int) and isinstance(data, bytes):
-                        yield self._topics[number], log_time_ns(log_ns), data
-                    else:
+                    if not isinstance(log_ns, int) or not isinstance(data, bytes):
                         strangers += 1
+                        continue
+                    if not counted:
+                        self.saw(self._topics[number], log_time_ns(log_ns))
+                    if number in numbers:
+                        yield self._topics[number], log_time_ns(log_ns), data
         except sqlite3.Error as error:
             self.losses.append(f"{self._path.name}: the database is damaged, the messages after it are lost: {error}")
         if strangers:
@@ -75,6 +78,8 @@ class Db3File(Bag):
         database.text_factory = lambda raw: raw.decode("utf-8", "replace")
         database.execute("PRAGMA trusted_schema=OFF")
         database.execute("PRAGMA cell_size_check=ON")
+        # Else SQLite refuses a file that was cut off, whole as its beginning may be.
+        database.execute("PRAGMA writable_schema=ON")
         return database
 
     def _read_topics(self, database: sqlite3.Connection) -> None:
@@ -85,20 +90,30 @@ class Db3File(Bag):
         }
         if not {"topics", "messages"} <= tables:
             raise sqlite3.DatabaseError(f"tables {', '.join(sorted(map(str, tables))) or 'none'}")
-        schemas: dict[str, tuple[str, str]] = {}
-        if "message_definitions" in tables:
-            rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
-            schemas = {str(kind): (str(encoding), str(text)) for kind, encoding, text in rows}
+        schemas = self._schemas(database) if "message_definitions" in tables else {}
         for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
             schema_encoding, text = schemas.get(str(kind), ("", ""))
             topic = Topic(str(name), str(kind), str(encoding), schema_encoding, text.encode())
-            self._topics[number] = topic
-            self.known(topic)
+            if isinstance(number, int):
+                self._topics[number] = topic
+                self.known(topic)
 
-    def _count(self, database: sqlite3.Connection) -> None:
-        rows = database.execute(
-            "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
-        )
+    def _schemas(self, database: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+        """Encoding and text of the types' definitions; standard types do without."""
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        try:
+            return {str(kind): (str(encoding), str(text)) for kind, encoding, text in database.execute(query)}
+        except sqlite3.Error as error:
+            self.losses.append(f"{self._path.name}: the definitions of the message types are damaged: {error}")
+            return {}
+
+    def _count(self, database: sqlite3.Connection) -> bool:
+        """Counts all messages, or none where the database is damaged."""
+        query = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
+        try:
+            rows = database.execute(query).fetchall()
+        except sqlite3.Error:
+            return False
         strangers = 0
         for number, count, first, last in rows:
             topic = self._topics.get(number)
@@ -110,6 +125,7 @@ class Db3File(Bag):
                 self.spans(log_time_ns(first), log_time_ns(last))
         if strangers:
             self.losses.append(f"{strangers} messages of topics that the bag does not describe")
+        return True
 
 
 class Rosbag2Folder(Bag):

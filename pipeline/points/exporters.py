@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from pipeline.engine.errors import ResourceError, UsageError
+from pipeline.points.colmap_export import SUFFIX
 from pipeline.points.geoparquet import ROW_GROUP, PointDataset, PointsWriter
 from pipeline.points.gpkg import write_gpkg
 from pipeline.points.las import write_las
@@ -54,7 +55,7 @@ def export_points(points_folder: Path, target: Path) -> int:
             "no such format to export to",
             where=str(target),
             found=target.suffix or "no suffix",
-            expected=", ".join(WRITERS),
+            expected=", ".join((*WRITERS, SUFFIX)),
             hint=f"--to {target.with_suffix('.laz')}",
         )
     points = PointDataset(points_folder)

@@ -1,4 +1,4 @@
-"""What a source holds, as plain values: photos, exposure marks, LiDAR tiles, tables and run folders."""
+"""What a source holds, as plain values: photos, exposure marks, logs, LiDAR tiles, tables and run folders."""
 
 from __future__ import annotations
 
@@ -15,15 +15,19 @@ import pyarrow.parquet as pq
 from pipeline.engine.errors import EpiTransferError, InputError
 from pipeline.lidar.tile_crs import tile_crs
 from pipeline.lidar.tiles import read_header
+from pipeline.log_inspection import describe_clip, describe_log
 from pipeline.sources import datums
 from pipeline.sources.accuracy import LoggedSigmas, pose_sigmas
 from pipeline.sources.files import IMAGE_SUFFIXES, MARK_SUFFIXES, find, is_url, opened
+from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES, is_log_folder, knows
 from pipeline.sources.mrk import read_marks
 from pipeline.sources.photos import PhotoRecord, read_photo
+from pipeline.sources.video import VIDEO_SUFFIXES
 
 TILE_SUFFIXES = (".las", ".laz")
 TABLE_SUFFIXES = (".parquet",)
 _MANIFEST = "manifest.json"
+_TEXTS = (".csv", ".txt")
 
 
 def describe(source: str) -> list[dict[str, Any]]:
@@ -41,21 +45,34 @@ def describe(source: str) -> list[dict[str, Any]]:
     """
     if not is_url(source) and (Path(source) / _MANIFEST).is_file():
         return [_run_folder(Path(source))]
-    files = find(source, (*IMAGE_SUFFIXES, *MARK_SUFFIXES, *TILE_SUFFIXES, *TABLE_SUFFIXES))
+    if is_log_folder(source):
+        return [describe_log(source)]
+    files = find(
+        source,
+        (*IMAGE_SUFFIXES, *MARK_SUFFIXES, *TILE_SUFFIXES, *TABLE_SUFFIXES, *LOG_SUFFIXES, *BAG_SUFFIXES, *_TEXTS,
+         *VIDEO_SUFFIXES),
+    )  # fmt: skip
     out: list[dict[str, Any]] = []
     if images := _ending(files, IMAGE_SUFFIXES):
         out.append(photos(source, [read_photo(image) for image in sorted(images)]))
     out += [_marks(file) for file in _ending(files, MARK_SUFFIXES)]
     out += [_tile(Path(file)) for file in _ending(files, TILE_SUFFIXES)]
     out += [_table(Path(file)) for file in _ending(files, TABLE_SUFFIXES)]
+    out += [describe_clip(file) for file in _ending(files, VIDEO_SUFFIXES)]
+    # Of a folder's texts only those that a reader knows; one that is named itself is a log or an error.
+    logs = _ending(files, (*LOG_SUFFIXES, *BAG_SUFFIXES))
+    logs += [file for file in _ending(files, _TEXTS) if file == source or knows(file)]
+    out += [describe_log(file) for file in logs]
+    if not out and files == [source]:
+        out.append(describe_log(source))
     if not out:
         raise InputError(
             "E-INSPECT-01",
             "nothing here that can be inspected",
             where=source,
             found="a folder without any of these" if Path(source).is_dir() else Path(source).name,
-            expected="photos, .mrk, .las/.laz, .parquet, or a run folder",
-            hint="logs, bags and subtitles cannot be read yet",
+            expected="photos, .mrk, logs, bags, .srt, trajectories, videos, .las/.laz, .parquet, or a run folder",
+            hint="name the file itself if it has another ending",
         )
     return out
 

@@ -1,4 +1,4 @@
-"""inspect: what a photo folder, exposure log, tile, table or run folder holds."""
+"""inspect: what a photo folder, log, bag, tile, table or run folder holds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 
 def command(
-    source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Photos, .mrk, .laz, .parquet or a run.")],
+    source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Photos, logs, bags, .mrk, .laz, .parquet, a run.")],
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Tell what sources hold: counts, time span, clock, poses, camera, heights, problems."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -26,12 +27,15 @@ def command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
     photos: Annotated[str | None, typer.Option(help="Photo folder, instead of a workflow.")] = None,
+    logs: Annotated[list[str] | None, typer.Option(help="Log or bag with the poses; repeatable.")] = None,
+    bags: Annotated[list[str] | None, typer.Option(help="Bag whose images are used too; repeatable.")] = None,
     camera: Annotated[str | None, typer.Option(help="Camera calibration YAML, with --photos.")] = None,
     lidar: Annotated[str | None, typer.Option(help="LiDAR tiles to score against, with --photos.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Runs every stage the workflow has a section for; what is up to date is skipped."""
-    layers = [_sources(workflow, photos, camera, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
+    given = {"photos": photos, "logs": logs, "bags": bags, "camera": camera}
+    layers = [_sources(workflow, given, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
     configuration = resolve(layers, MODELS)
     if "ingest" not in configuration.sections:
         raise UsageError(
@@ -46,10 +50,9 @@ def command(
         typer.echo(f"{folder.root}: " + (list(records.values())[-1]["summary"] if records else "nothing to do"))
 
 
-def _sources(workflow: Path | None, photos: str | None, camera: str | None, lidar: str | None) -> tuple[str, Sections]:
-    given = {"photos": photos, "camera": camera, "lidar": lidar}
+def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None) -> tuple[str, Sections]:
     if workflow is not None:
-        if clash := [name for name, value in given.items() if value]:
+        if clash := [name for name, value in {**ingest, "lidar": lidar}.items() if value]:
             raise UsageError(
                 "E-RUN-08",
                 f"--{clash[0]} stands in for a workflow file, and one is given",
@@ -57,12 +60,12 @@ def _sources(workflow: Path | None, photos: str | None, camera: str | None, lida
                 hint=f"use --set {'score.lidar' if clash[0] == 'lidar' else 'ingest.' + clash[0]}=...",
             )
         return workflow.name, load_workflow(workflow, MODELS)
-    if photos is None:
+    if not (ingest["photos"] or ingest["bags"]):
         raise UsageError(
-            "E-RUN-09", "nothing to run", expected="WORKFLOW.toml or --photos DIR", hint="epitransfer run --help"
+            "E-RUN-09", "nothing to run", expected="WORKFLOW.toml, --photos DIR or --bags FILE", hint="epitransfer run --help"
         )
     sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}
-    sections["ingest"] = {key: value for key, value in (("photos", photos), ("camera", camera)) if value}
+    sections["ingest"] = {key: value for key, value in ingest.items() if value}
     if lidar:
         sections["score"] = {"lidar": lidar}
     return "command line", absolute_paths(sections, MODELS, Path.cwd())

@@ -178,7 +178,7 @@ def test_a_workflow_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[s
         "[ingest\n": (2, "E-CONFIG-02"),
         "ingest = 3\n": (2, "E-CONFIG-03"),
         "[ingset]\n": (2, "E-CONFIG-05"),
-        "[ingest]\n": (2, "E-CONFIG-08"),
+        "[ingest]\n": (2, "E-CONFIG-09"),
         "[ingest]\nphoto = 'x'\n": (2, "E-CONFIG-06"),
         "[pair]\n": (2, "E-RUN-07"),
         "[ingest]\nphotos = 'nowhere'\n": (3, "E-FILE-01"),

@@ -24,8 +24,9 @@ _ROUNDS = 6
 # Drift is estimated where the flight is long enough to show it.
 _DRIFT_SPAN_S = 300.0
 _DRIFT_MATCHES = 12
-# Log-odds: what a photo without an event, and an event without a photo, cost; and by how much the best has to lead.
-_LOST_EVENT, _LOST_PHOTO = 3.0, 1.0
+# Log-odds: what a photo without an event costs (a hot shoe misses one in some hundred), and an event without a photo
+# (test shots and lost files are common); and by how much the best has to lead.
+_LOST_EVENT, _LOST_PHOTO = 5.0, 1.0
 _MARGIN = 6.0
 # Two offsets nearer than this are one.
 _LEAST_APART_S = 0.02

@@ -234,6 +234,14 @@ def _explained(name: str, error: ValidationError, origins: Mapping[str, str]) ->
             where=f"[{name}]",
             hint=f"put it into the workflow, or give --set {key}=...",
         )
+    if not first["loc"]:
+        # A rule on the section as a whole.
+        return UsageError(
+            "E-CONFIG-09",
+            f"[{name}] does not say enough",
+            where=f"[{name}]",
+            expected=str(first["msg"]).removeprefix("Value error, "),
+        )
     return UsageError(
         "E-CONFIG-07",
         f"{key} has a value that is not allowed",

@@ -20,9 +20,9 @@ from pipeline.placing.timeline import Timeline
 from pipeline.sources.photos import PhotoRecord
 from pipeline.sources.records import Events
 
-# Photo clocks that say UTC themselves are this near it.
+# Photo clocks that say UTC themselves are this near it, and users state offsets to a good half second.
 _TRUSTED_SIGMA_S = 2.0
-_STATED_SIGMA_S = 1.0
+_STATED_SIGMA_S = 0.4
 # Which time tags say UTC: the others are a local time whose zone nobody wrote down.
 TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone", "header stamp"})
 _LEAST_SHARE = 0.5
@@ -241,7 +241,7 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
     shared_ns = line.utc_ns(stream.time_ns)
     if not np.any((at_ns >= shared_ns[0]) & (at_ns <= shared_ns[-1])):
         return Refusal((no_overlap_hint(photos, int(shared_ns[0]), int(shared_ns[-1])),))
-    sigma_s = _HEADER_SIGMA_S if header else float(np.hypot(_STATED_SIGMA_S / 2.0, photos.tick_s / np.sqrt(12.0)))
+    sigma_s = _HEADER_SIGMA_S if header else float(np.hypot(_STATED_SIGMA_S, photos.tick_s / np.sqrt(12.0)))
     method = "stated by the user" if stated_s is not None else f"said by the files ({photos.records[0].time_source})"
     note = "" if header else "nothing checks this offset: no camera events, no positions"
     return _by_offset(photos, line, at_ns, sigma_s, method, offset_s, 0, note)

@@ -18,13 +18,11 @@ from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.files import find, is_url, stem
 from pipeline.sources.intrinsics import SourcedCamera
-from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES
+from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES, is_log_folder
 from pipeline.sources.photos import PhotoRecord
 from pipeline.sources.records import FlightLog, ImageStream
 from pipeline.tracks.mount import Mount
 from pipeline.tracks.spacing import spaced
-
-_FOLDERS = ("metadata.yaml", "cameras.bin", "cameras.txt")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +61,7 @@ def find_logs(names: str | Sequence[str] | None) -> list[str]:
     listed = [] if names is None else [names] if isinstance(names, str) else list(names)
     found: set[str] = set()
     for name in listed:
-        if not is_url(name) and any((Path(name) / mark).is_file() for mark in _FOLDERS):
+        if is_log_folder(name):
             found.add(name)
             continue
         hits = find(name, (*LOG_SUFFIXES, *BAG_SUFFIXES))

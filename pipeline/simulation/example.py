@@ -1,4 +1,4 @@
-"""Writes the example: photos, tiles, control points, the truth, and a workflow that runs them."""
+"""Writes the example: photos, logs, tiles, control points, the truth, and workflows that run them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ import numpy as np
 from pipeline.engine.errors import ResourceError, UsageError
 from pipeline.engine.executors import executor_for
 from pipeline.geometry.cameras import Camera
+from pipeline.simulation.bare import CAMERA_FILE, camera_time_error, camera_yaml, missing_frame, workflows, write_logs
 from pipeline.simulation.control import gcp_list, observe
 from pipeline.simulation.flight import CONSUMER_DRONE, FEWEST_FRAMES, Trajectory, fly, frame_id, logged_poses
 from pipeline.simulation.grid import COMPOUND_CRS, navd88_height
-from pipeline.simulation.photos import LoggedPose, save_photo
+from pipeline.simulation.photos import LoggedPose, save_bare, save_photo
 from pipeline.simulation.render import CAMERA, Renderer, camera_rays, exposed
 from pipeline.simulation.shading import Shader
 from pipeline.simulation.site import UNDULATION_M, Site
@@ -38,6 +39,8 @@ height_datum = "navd88"
 geoid = {UNDULATION_M:.1f}
 crs = "{COMPOUND_CRS}"
 
+"""
+_STAGES = """\
 [pair]
 baseline_m = [3.0, 16.0]
 
@@ -187,7 +190,7 @@ def _explained(directory: Path) -> Iterator[None]:
             "the disk is full" if full else "the example cannot be written",
             where=str(error.filename or directory),
             found=error.strerror or str(error),
-            hint="free some space: 24 frames take about 100 MB" if full else "name a folder that you may write to",
+            hint="free some space: 24 frames take about 130 MB" if full else "name a folder that you may write to",
         ) from error
 
 
@@ -199,7 +202,7 @@ def _shares(folder: Path, frames: int, seed: int, jobs: int, camera: Camera) -> 
 
 def _write(folder: Path, shares: list[_Share]) -> tuple[int, int]:
     """Writes everything; returns the numbers of control point observations and LiDAR returns."""
-    for name in ("photos", "lidar", "truth/depth"):
+    for name in ("photos", "bare", "logs", "lidar", "truth/depth"):
         (folder / name).mkdir(parents=True)
     with executor_for(len(shares)) as executor:
         for _ in executor.map(_render, shares):
@@ -213,8 +216,11 @@ def _write(folder: Path, shares: list[_Share]) -> tuple[int, int]:
         "gcp_list.txt": gcp_list(site, observations),
         "truth/poses.csv": poses_csv(site, true_poses),
         "truth/site.json": site_json(site, camera, CONSUMER_DRONE, true_poses, observations),
-        "workflow.toml": _WORKFLOW,
+        "workflow.toml": _WORKFLOW + _STAGES,
+        CAMERA_FILE: camera_yaml(camera),
+        **workflows(_STAGES),
     }
+    write_logs(folder / "logs", site, camera, logged_poses(true_poses, CONSUMER_DRONE, shares[0].seed))
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     return len(observations), len(returns.line)
@@ -235,4 +241,7 @@ def _render(share: _Share) -> None:
         image = exposed(picture, np.random.default_rng([share.seed, 6, index]))
         name = frame_id(index)
         save_photo(share.folder / "photos" / f"{name}.JPG", image, share.camera, logged(site, logged_as, index))
+        if index != missing_frame(share.frames):
+            shown = true_poses.exposure(index) + camera_time_error()
+            save_bare(share.folder / "bare" / f"{name}.JPG", image, share.camera, shown)
         save_depth(share.folder / "truth" / "depth" / f"{name}.npz", depth)

@@ -66,28 +66,25 @@ def save_photo(path: Path, picture: Bytes, camera: Camera, pose: LoggedPose) -> 
     Image.fromarray(picture).save(path, "JPEG", quality=QUALITY, exif=exif(camera, pose), xmp=packet)
 
 
+def save_bare(path: Path, picture: Bytes, camera: Camera, time: datetime) -> None:
+    """Writes the same picture as a camera does that knows nothing of the drone: its own clock, no place, no attitude.
+
+    Args:
+        path: Where.
+        picture: (height, width, 3) red, green, blue.
+        camera: Its camera, for the focal length.
+        time: What the camera's clock says; written without a zone.
+    """
+    Image.fromarray(picture).save(path, "JPEG", quality=QUALITY, exif=_camera_tags(camera, time))
+
+
 def exif(camera: Camera, pose: LoggedPose) -> Image.Exif:
     """The EXIF tags of a photo.
 
     Source: CIPA DC-008 (EXIF 2.32).
     """
-    tags = Image.Exif()
-    taken = pose.time.strftime("%Y:%m:%d %H:%M:%S")
-    tags[Base.Make], tags[Base.Model], tags[Base.DateTime] = MAKE, MODEL, taken
-    focal_mm = camera.focal_px * _PIXEL_MM
-    diagonal_mm = float(np.hypot(camera.width, camera.height)) * _PIXEL_MM
-    tags.get_ifd(IFD.Exif).update(
-        {
-            Base.ExifVersion: b"0232",
-            Base.DateTimeOriginal: taken,
-            Base.OffsetTimeOriginal: "+00:00",
-            Base.SubsecTimeOriginal: f"{pose.time.microsecond // 1000:03d}",
-            Base.FocalLength: _rational(focal_mm, 10_000),
-            Base.FocalLengthIn35mmFilm: round(focal_mm * _FULL_FRAME_MM / diagonal_mm),
-            Base.ExifImageWidth: camera.width,
-            Base.ExifImageHeight: camera.height,
-        }
-    )
+    tags = _camera_tags(camera, pose.time)
+    tags.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+00:00"
     tags.get_ifd(IFD.GPSInfo).update(
         {
             GPS.GPSVersionID: b"\x02\x03\x00\x00",
@@ -98,6 +95,27 @@ def exif(camera: Camera, pose: LoggedPose) -> Image.Exif:
             GPS.GPSAltitudeRef: b"\x00" if pose.navd88_m >= 0.0 else b"\x01",
             GPS.GPSAltitude: _rational(abs(pose.navd88_m), 1000),
             GPS.GPSHPositioningError: _rational(_HORIZONTAL_ERROR_M, 100),
+        }
+    )
+    return tags
+
+
+def _camera_tags(camera: Camera, time: datetime) -> Image.Exif:
+    """What a camera knows by itself: who made it, its clock, its lens."""
+    tags = Image.Exif()
+    taken = time.strftime("%Y:%m:%d %H:%M:%S")
+    tags[Base.Make], tags[Base.Model], tags[Base.DateTime] = MAKE, MODEL, taken
+    focal_mm = camera.focal_px * _PIXEL_MM
+    diagonal_mm = float(np.hypot(camera.width, camera.height)) * _PIXEL_MM
+    tags.get_ifd(IFD.Exif).update(
+        {
+            Base.ExifVersion: b"0232",
+            Base.DateTimeOriginal: taken,
+            Base.SubsecTimeOriginal: f"{time.microsecond // 1000:03d}",
+            Base.FocalLength: _rational(focal_mm, 10_000),
+            Base.FocalLengthIn35mmFilm: round(focal_mm * _FULL_FRAME_MM / diagonal_mm),
+            Base.ExifImageWidth: camera.width,
+            Base.ExifImageHeight: camera.height,
         }
     )
     return tags

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import glob
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -155,12 +156,12 @@ def common_root(locations: Sequence[str]) -> str:
 
 
 def relative_to(location: str, root: str) -> str:
-    """A location relative to the photo root, with forward slashes; itself where it is not below the root."""
+    """A location relative to the photo root, with forward slashes; with "../" where it is not below it."""
     if not root:
         return location
     if is_url(location):
         return location.removeprefix(root).lstrip("/")
-    return Path(location).absolute().relative_to(root).as_posix()
+    return Path(os.path.relpath(location, root)).as_posix()
 
 
 def _parts(folder: str) -> tuple[str, ...]:

@@ -50,6 +50,22 @@ LOG_SUFFIXES = (".bin", ".log", ".ulg", ".tlog", ".srt", ".tum")
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 
 
+# Folders that are one log: what such a folder holds.
+_FOLDER_MARKS = ("metadata.yaml", "cameras.bin", "cameras.txt")
+
+
+def is_log_folder(location: str) -> bool:
+    """Whether a location is a folder that is itself a log: a ROS 2 bag, a COLMAP model."""
+    return not is_url(location) and any((Path(location) / mark).is_file() for mark in _FOLDER_MARKS)
+
+
+def knows(location: str) -> bool:
+    """Whether any reader takes a file for its own, by its beginning and its name."""
+    with opened(location) as stream:
+        head = stream.read(_HEAD_BYTES)
+    return any(known.load("is_format")(head, location) for known in FORMATS)
+
+
 def read_log(location: str) -> FlightLog:
     """Reads a log, bag, subtitle file or trajectory.
 

@@ -25,6 +25,8 @@ from bag_files import (
     write_mcap,
     write_ros1,
 )  # fmt: skip
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from fuzzing import check
 from hypothesis import given
@@ -352,6 +354,26 @@ def test_transform_trees(tmp_path: Path) -> None:
     np.testing.assert_allclose(move, [2.0, 2.0, 3.0], atol=1e-15)
     np.testing.assert_allclose(turn, [0.5] * 4, atol=1e-15)
     assert transform_between(log.transforms, "base", "map") is None
+
+
+def test_foxglove_transforms(tmp_path: Path) -> None:
+    """Alone and in lists; one that came once, as fixed ones do, is fixed."""
+    rows: list[Row] = []
+    for n in range(3):
+        moving = FrameTransform(parent_frame_id="map", child_frame_id="base")
+        moving.timestamp.FromNanoseconds(at(n))
+        moving.translation.x, moving.rotation.w = float(n), 1.0
+        rows += [("/moves", at(n), moving), ("/list", at(n), FrameTransforms(transforms=[moving]))]
+    fixed = FrameTransform(parent_frame_id="base", child_frame_id="camera", timestamp=moving.timestamp)
+    fixed.translation.z, fixed.rotation.x = 0.5, 1.0
+    log = read_log(str(write_mcap(tmp_path / "bag.mcap", [*rows, ("/once", at(0), fixed)], "protobuf")))
+    check(log)
+    assert {stream.stream: stream.position_m[:, 0].tolist() for stream in log.poses} == {
+        "/moves map>base": [0.0, 1.0, 2.0], "/list map>base": [0.0, 1.0, 2.0], "/once base>camera": [0.0],
+    }  # fmt: skip
+    (transform,) = log.transforms
+    assert (transform.parent, transform.child, transform.source) == ("base", "camera", "/once")
+    assert (transform.translation_m.tolist(), transform.q_wxyz.tolist()) == ([0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0])
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=21, max_size=21), st.integers(0, 3), st.integers(0, 3))

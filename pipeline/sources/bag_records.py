@@ -32,7 +32,6 @@ _REPORTED_SIGMA_S, _TRIGGERED_SIGMA_S = 0.001, 0.01
 # Half turns, w first: about east + north, and about forward.
 _NED_FROM_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 _FLU_FROM_FRD = np.array([0.0, 1.0, 0.0, 0.0])
-_STILL = 2
 # The body's own frame (REP 105): an IMU may be mounted any way in it.
 _BODY = "base_link"
 
@@ -174,11 +173,11 @@ class _Maker:
         )
 
     def _transforms(self) -> tuple[FixedTransform, ...]:
-        """Latched transforms, and those of the dynamic tree that never change: ROS 1 publishes fixed ones there."""
+        """Latched transforms, and edges that never change: ROS 1 and Foxglove publish fixed ones among the others."""
         fixed = {key: np.array(values) for key, values in self._of.static.items()}
         for key, samples in self._of.edges.items():
             values = samples.values
-            if len(values) >= _STILL and np.all(values == values[0]):
+            if len(values) and np.all(values == values[0]):
                 fixed.setdefault(key, values[0])
         out = []
         for (topic, parent, child), values in fixed.items():

@@ -2,8 +2,8 @@
 
     python benchmarks/logs_truth.py EXAMPLE RUN RUNS
 
-EXAMPLE is the folder of `epitransfer example`, RUN a finished run of its workflow.toml (DJI stills), RUNS a folder for the
-runs from logs, which are made here where they are not there yet.
+EXAMPLE is the folder of `epitransfer example`, RUN a finished run of its workflow.toml (DJI stills), RUNS a folder for
+the runs from logs, which are made here where they are not there yet.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ METHOD = "epitransfer"
 
 
 def main() -> None:
+    """Prints a line per kind of log."""
     example, stills, runs = (Path(argument) for argument in sys.argv[1:4])
     truth = true_times(example)
     reference = observed(stills)
@@ -52,6 +53,7 @@ def made(workflow: Path, run: Path) -> None:
 
 
 def true_times(example: Path) -> dict[str, datetime]:
+    """The true exposure of every frame."""
     with (example / "truth" / "poses.csv").open(newline="") as stream:
         return {row["frame_id"]: datetime.fromisoformat(row["time"]) for row in csv.DictReader(stream)}
 

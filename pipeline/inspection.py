@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ TILE_SUFFIXES = (".las", ".laz")
 TABLE_SUFFIXES = (".parquet",)
 _MANIFEST = "manifest.json"
 _TEXTS = (".csv", ".txt")
+# What is something else than a log, whatever is in it.
+_NAMED = (*IMAGE_SUFFIXES, *MARK_SUFFIXES, *TILE_SUFFIXES, *TABLE_SUFFIXES, *VIDEO_SUFFIXES)
 
 
 def describe(source: str) -> list[dict[str, Any]]:
@@ -55,16 +57,20 @@ def describe(source: str) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     if images := _ending(files, IMAGE_SUFFIXES):
         out.append(photos(source, [read_photo(image) for image in sorted(images)]))
-    out += [_marks(file) for file in _ending(files, MARK_SUFFIXES)]
-    out += [_tile(Path(file)) for file in _ending(files, TILE_SUFFIXES)]
-    out += [_table(Path(file)) for file in _ending(files, TABLE_SUFFIXES)]
-    out += [describe_clip(file) for file in _ending(files, VIDEO_SUFFIXES)]
-    # Of a folder's texts only those that a reader knows; one that is named itself is a log or an error.
+    # Of a folder's texts only those that a reader knows; a file that is named itself is a log or an error.
     logs = _ending(files, (*LOG_SUFFIXES, *BAG_SUFFIXES))
     logs += [file for file in _ending(files, _TEXTS) if file == source or knows(file)]
-    out += [describe_log(file) for file in logs]
-    if not out and files == [source]:
-        out.append(describe_log(source))
+    if not out and files == [source] and not source.lower().endswith(_NAMED):
+        logs = [source]
+    kinds = (
+        (_marks, _ending(files, MARK_SUFFIXES)),
+        (_tile, _ending(files, TILE_SUFFIXES)),
+        (_table, _ending(files, TABLE_SUFFIXES)),
+        (describe_clip, _ending(files, VIDEO_SUFFIXES)),
+        (describe_log, logs),
+    )
+    alone = len(files) == 1
+    out += [_described(describe_one, file, alone=alone) for describe_one, named in kinds for file in named]
     if not out:
         raise InputError(
             "E-INSPECT-01",
@@ -75,6 +81,17 @@ def describe(source: str) -> list[dict[str, Any]]:
             hint="name the file itself if it has another ending",
         )
     return out
+
+
+def _described(describe_one: Callable[[str], dict[str, Any]], file: str, *, alone: bool) -> dict[str, Any]:
+    """One file's description; among others an unreadable one is told beside them."""
+    try:
+        return describe_one(file)
+    except InputError as error:
+        if alone:
+            raise
+        told = "; ".join(text for text in (error.message, error.found, error.hint) if text)
+        return {"kind": "unreadable", "source": file, "problem": told}
 
 
 def photos(source: str, records: Sequence[PhotoRecord]) -> dict[str, Any]:
@@ -163,8 +180,9 @@ def _marks(location: str) -> dict[str, Any]:
     }
 
 
-def _tile(path: Path) -> dict[str, Any]:
+def _tile(location: str) -> dict[str, Any]:
     """A tile's header; its points are not read."""
+    path = Path(location)
     header = read_header(path)
     problem = ""
     try:
@@ -184,7 +202,8 @@ def _tile(path: Path) -> dict[str, Any]:
     }
 
 
-def _table(path: Path) -> dict[str, Any]:
+def _table(location: str) -> dict[str, Any]:
+    path = Path(location)
     try:
         file = pq.ParquetFile(path, arrow_extensions_enabled=False)
         rows, schema = file.metadata.num_rows, file.schema_arrow
@@ -215,7 +234,7 @@ def _run_folder(folder: Path) -> dict[str, Any]:
         raise InputError(
             "E-INSPECT-04", "the manifest cannot be read", where=str(folder / _MANIFEST), found=str(error)
         ) from error
-    tables = [_table(file) for file in sorted(folder.rglob("*.parquet")) if not _hidden(file, folder)]
+    tables = [_table(str(file)) for file in sorted(folder.rglob("*.parquet")) if not _hidden(file, folder)]
     rows: Counter[str] = Counter()
     for table in tables:
         rows[str(table["table"])] += int(table["rows"])

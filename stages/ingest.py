@@ -7,8 +7,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.engine.errors import EpiTransferError
 from pipeline.engine.stage import Context, Stage, StageConfig
@@ -17,33 +16,12 @@ from pipeline.placing import steps
 from pipeline.placing.gather import files_of, find_logs
 from pipeline.placing.tables import clock_row, track_pieces
 from pipeline.placing.telling import record_facts, summary, warn_of
+from pipeline.sources.accuracy import local_sigmas
 from pipeline.sources.datums import AUTO
 from pipeline.sources.files import MARK_SUFFIXES, beside, common_root, find, find_images, is_url
 from pipeline.sources.frames import assemble
 from pipeline.sources.video import VIDEO_SUFFIXES, srt_beside
-from pipeline.tracks.mount import Mount
-
-
-class MountConfig(BaseModel):
-    """How a sensor sits on the vehicle."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    yaw_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, 90 right (deg)")
-    pitch_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, -90 down (deg)")
-    roll_deg: float | None = Field(default=None, description="About the optical axis, clockwise (deg)")
-    lever_arm_m: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.0), description="From the antenna, or what is posed, to the sensor: forward, right, down (m)"
-    )
-
-    def mount(self) -> Mount:
-        """As geometry; angles that are not stated are none where none is, and 0 beside others."""
-        angles = (self.yaw_deg, self.pitch_deg, self.roll_deg)
-        if all(angle is None for angle in angles):
-            return Mount(None, self.lever_arm_m)
-        yaw, pitch, roll = (float(np.radians(angle or 0.0)) for angle in angles)
-        return Mount((yaw, pitch, roll), self.lever_arm_m)
-
+from stages.mount_config import MountConfig
 
 _Paths = str | tuple[str, ...] | None
 _PATH: dict[str, Any] = {"path": True}
@@ -82,6 +60,12 @@ class Config(StageConfig):
     image_topic: str | None = Field(None, description="Topic of the images to use in bags; none: the longest")
     up_axis: Literal["z", "y"] = Field("z", description="Which axis of a local frame points up: y in motion capture")
     frame_spacing_m: float = Field(1.0, gt=0.0, description="Way between two images taken out of a bag or video (m)")
+    pose_sigma_m: float = Field(
+        0.003, gt=0.0, description="One sigma of positions in a local frame along each axis, new in each pose (m)"
+    )
+    pose_sigma_deg: float = Field(
+        0.1, gt=0.0, description="One sigma of attitudes in a local frame about each axis, new in each pose (deg)"
+    )
     height_datum: str = Field(
         AUTO,
         description="What the absolute heights are measured from: ellipsoidal, egm96, egm2008, navd88, takeoff, "
@@ -134,6 +118,7 @@ def run(config: Config, context: Context) -> str:
         height_datum=config.height_datum,
         geoid=config.geoid,
         clock_offset_s=wishes.clock_offset_s or 0.0,
+        local_sigmas=local_sigmas(config.pose_sigma_m, config.pose_sigma_deg),
         log_clocks=[*(clock_row(line, root) for line in lines), *placed.clocks],
     )
     context.write("frames", found.frames)

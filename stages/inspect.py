@@ -10,7 +10,9 @@ import typer
 
 
 def command(
-    source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Photos, logs, bags, .mrk, .laz, .parquet, a run.")],
+    source: Annotated[
+        list[str], typer.Argument(metavar="SOURCE...", help="Photos, logs, bags, .mrk, .laz, .parquet, a run.")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Tell what sources hold: counts, time span, clock, poses, camera, heights, problems."""

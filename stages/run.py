@@ -62,7 +62,10 @@ def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None
         return workflow.name, load_workflow(workflow, MODELS)
     if not (ingest["photos"] or ingest["bags"]):
         raise UsageError(
-            "E-RUN-09", "nothing to run", expected="WORKFLOW.toml, --photos DIR or --bags FILE", hint="epitransfer run --help"
+            "E-RUN-09",
+            "nothing to run",
+            expected="WORKFLOW.toml, --photos DIR or --bags FILE",
+            hint="epitransfer run --help",
         )
     sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}
     sections["ingest"] = {key: value for key, value in ingest.items() if value}

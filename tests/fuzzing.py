@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.engine.errors import InputError
 from pipeline.sources.records import FlightLog
 
@@ -25,7 +27,7 @@ def mutations_wanted(default: int = 150) -> int:
 def mutations(data: bytes, count: int, seed: int = 0) -> Iterator[bytes]:
     """Damaged copies of a file's bytes, the same for the same seed."""
     for index in range(count):
-        rng = random.Random(seed * 1_000_003 + index)
+        rng = random.Random(seed * 1_000_003 + index)  # noqa: S311 - damage, not secrets
         out = bytearray(data)
         for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
             _damage(out, rng)
@@ -69,23 +71,26 @@ def survives(read: Callable[[str], FlightLog], data: bytes, path: Path, count: i
     for number, mutated in enumerate(mutations(data, count, seed)):
         path.write_bytes(mutated)
         began = time.monotonic()
-        try:
-            log = read(str(path))
-        except InputError as error:
-            assert str(path) in error.where, f"mutation {number}: the error names no file: {error}"
-            outcomes["refused"] += 1
-        else:
-            check(log)
-            outcomes["partial" if log.losses else "whole"] += 1
+        outcomes[_outcome(read, path, number)] += 1
         took = time.monotonic() - began
         assert took < SLOWEST_S, f"mutation {number} took {took:.1f} s"
     return outcomes
 
 
+def _outcome(read: Callable[[str], FlightLog], path: Path, number: int) -> str:
+    try:
+        log = read(str(path))
+    except InputError as error:
+        where = error.where
+    else:
+        check(log)
+        return "partial" if log.losses else "whole"
+    assert str(path) in where, f"mutation {number}: the error names no file: {where}"
+    return "refused"
+
+
 def check(log: FlightLog) -> None:
     """What every reader promises of its records."""
-    import numpy as np
-
     assert log.kind
     for stream in (*log.positions, *log.attitudes, *log.events, *log.poses):
         n = len(stream.time_ns)

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.clocks.fit import fit_clock
@@ -142,6 +142,7 @@ class TestIntervals:
         told = [k for k in range(24) if len(rivals_of(k, float(predicted[k]), best, events, 1.0))]
         assert told == [9]
 
+    @settings(max_examples=40)
     @given(
         st.integers(0, 10_000),
         st.floats(-1e6, 1e6),
@@ -155,7 +156,7 @@ class TestIntervals:
         found = align(shown(time_s[kept], offset_s, tick_s), time_s, tick_s)
         if found.best is not None and found.rival is None and found.best.matched == len(kept):
             error_s = np.abs(time_s[found.best.event] - time_s[kept])
-            # With whole seconds a lost photo's exposure can lie within the tick of its neighbour's; never with finer ones.
+            # With whole seconds a lost photo's exposure can lie within the tick of its neighbour's; else never.
             assert error_s.max() < (2.3 if tick_s == 1.0 else 1e-9)
 
 

@@ -1,8 +1,8 @@
 """Ingest as a whole: from folders of photos to the four tables."""
 
 import json
-import tempfile
 import math
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Photos brought to logs: clocks, exposures, mounts, lever arms, heights, local frames, and what is said when it fails."""
+"""Photos brought to logs: clocks, exposures, mounts, lever arms, heights, local frames, and refusals."""
 
 from __future__ import annotations
 

@@ -19,6 +19,8 @@ from pipeline.geometry.arrays import Floats, Ints
 # The clock of a camera and the instant its firmware notes are no better than this.
 _LEAST_SIGMA_S = 0.002
 _JITTER_S = 0.15
+# From this tick on residuals are spread evenly over the tick, and say nothing within it.
+COARSE_TICK_S = 0.1
 _CANDIDATES = 24
 _ROUNDS = 6
 # Drift is estimated where the flight is long enough to show it.
@@ -221,7 +223,7 @@ def _drift(photo_s: Floats, rest_s: Floats) -> float:
 
 def _centre(rest_s: Floats, tick_s: float) -> float:
     """The offset: the median, or the middle of the range where a coarse tick spreads residuals evenly."""
-    if tick_s < 0.1:
+    if tick_s < COARSE_TICK_S:
         return float(np.median(rest_s))
     low, high = np.quantile(rest_s, (0.05, 0.95))
     return float((low + high) / 2.0)
@@ -233,7 +235,7 @@ def _score(problem: _Problem, event: Ints, residual_s: Floats, sigma_s: float, o
     if not len(known):
         return 0.0
     rate = len(problem.event_s) / problem.span_s
-    if problem.tick_s > 4.0 * sigma_s or problem.tick_s >= 0.1:
+    if problem.tick_s > 4.0 * sigma_s or problem.tick_s >= COARSE_TICK_S:
         width = max(problem.tick_s, 2.0 * _JITTER_S)
         beyond = np.maximum(np.abs(known) - problem.tick_s / 2.0, 0.0) / _JITTER_S
         gain = -np.log(rate * width) - 0.5 * beyond**2

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from pipeline.clocks.fit import Nanoseconds
-from pipeline.clocks.intervals import FEWEST_MATCHES, Alignment, align, rivals_of
+from pipeline.clocks.intervals import COARSE_TICK_S, FEWEST_MATCHES, Alignment, align, rivals_of
 from pipeline.clocks.places import offset_by_place
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.placing.pose import level_track
@@ -165,7 +165,9 @@ def _matched(
     has = best.event >= 0
     shared_ns = base_ns + np.rint(predicted_s * 1e9).astype(np.int64)
     log_ns = np.where(has, events.time_ns[np.maximum(best.event, 0)], _log_ns(line, shared_ns))
-    fit_sigma_s = float(np.hypot(min(best.sigma_s, photos.tick_s + 0.1), photos.tick_s / np.sqrt(12.0)))
+    offset_sigma_s = _offset_sigma_s(best, photos.tick_s)
+    within_tick_s = photos.tick_s / np.sqrt(12.0) if photos.tick_s >= COARSE_TICK_S else best.sigma_s
+    fit_sigma_s = float(np.hypot(offset_sigma_s, within_tick_s))
     sigma_s = np.where(has, events.sigma_s, fit_sigma_s)
     reasons = [""] * len(has)
     for photo in np.flatnonzero(has).tolist():
@@ -180,9 +182,21 @@ def _matched(
         log_ns, sigma_s, best.event, tuple(reasons),
         f"intervals of {best.matched} of {len(event_s)} {'exposures' if events.feedback else 'triggers'} "
         f"({events.stream})",
-        best.offset_s + between_s, best.drift, float(fit_sigma_s / np.sqrt(best.matched)), best.rms_s, best.matched,
+        best.offset_s + between_s, best.drift, offset_sigma_s, best.rms_s, best.matched,
         events, "" if events.feedback else f"triggers, not exposures: the shutter's lag is unknown ({events.stream})",
     )  # fmt: skip
+
+
+def _offset_sigma_s(best: Alignment, tick_s: float) -> float:
+    """How well the events tell the offset; within a coarse tick, what the spread of the residuals leaves open.
+
+    Exposures on the beat of a coarse clock all show the same fraction of it: no number of them tells which.
+    """
+    known = best.residual_s[np.isfinite(best.residual_s)]
+    averaged_s = best.sigma_s / np.sqrt(len(known))
+    if tick_s < COARSE_TICK_S:
+        return float(averaged_s)
+    return float(max(tick_s - np.ptp(known), averaged_s) / np.sqrt(12.0))
 
 
 def _prior(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> tuple[float, float] | None:

@@ -243,5 +243,5 @@ def write_sweeps_of(context: Context, sources: Sequence[Source], origin: LocalFr
         stream = max(log.sweeps, key=lambda sweeps: sweeps.points)
         poses = sensor_poses(source.line, stream, wishes.lidar_mount, origin, y_up=wishes.y_up)
         folder = context.output("sweeps") / f"bag-{number:02d}"
-        written += write_sweeps(read_sweeps(log.location, stream.stream), poses, folder)
+        written += write_sweeps(read_sweeps(log.location, stream.stream, log.time_base.epoch), poses, folder)
     return written

@@ -12,7 +12,8 @@ from pipeline.geometry.rotations import enu_from_cam
 from pipeline.simulation.site import HEADING_RAD, place
 from pipeline.simulation.terrain import Terrain
 
-FIRST_EXPOSURE = datetime(2024, 6, 1, 15, 0, 0, tzinfo=UTC)
+# Not on a whole second: a camera clock whose fractions are all zero would be taken for one that has none.
+FIRST_EXPOSURE = datetime(2024, 6, 1, 15, 0, 0, 340_000, tzinfo=UTC)
 FORWARD, SIDEWAYS = "forward", "sideways"
 ABOVE_GROUND_M = 31.0
 SPACING_M = 5.0

@@ -63,6 +63,8 @@ pose_topic = "{POSE_TOPIC}"
 image_topic = "{IMAGE_TOPIC}"
 up_axis = "y"
 frame_spacing_m = 0.2
+pose_sigma_m = 0.001
+pose_sigma_deg = 0.05
 
 [pair]
 baseline_m = [0.3, 1.2]

@@ -94,7 +94,7 @@ def record(site: Site, logged: Trajectory) -> Recording:
     booted = FIRST_EXPOSURE - timedelta(seconds=BOOTED_BEFORE_S)
     every = round(_POSITION_HZ / _RECEIVER_HZ)
     return Recording(
-        boot_utc_ns=int(booted.timestamp()) * 1_000_000_000,
+        boot_utc_ns=round(booted.timestamp() * 1000.0) * 1_000_000,
         position_s=position_s + BOOTED_BEFORE_S,
         latitude_deg=latitude,
         longitude_deg=longitude,

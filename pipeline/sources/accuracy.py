@@ -32,7 +32,7 @@ class LoggedSigmas:
 
 @dataclass(frozen=True, slots=True)
 class TimingSigmas:
-    """One sigma of what the error of an exposure's instant, and lines between samples, add to a pose; new in each frame.
+    """One sigma of what an exposure's uncertain instant, and lines between samples, add to a pose; new in each frame.
 
     Args:
         position_m: East, north, up.
@@ -73,9 +73,6 @@ SIMULATED = DroneClass(
     horizontal_m=0.26, vertical_m=0.26, barometer_m=0.26, attitude_deg=(0.3536, 0.08, 0.08),
     own_position_m=(0.053, 0.053, 0.053), own_attitude_deg=(0.25, 0.08, 0.08),
 )  # fmt: skip
-# Motion capture, laser registration and good SLAM state no sigmas; this is what such poses are worth where image matches
-# could tell: frames of a headset with exact poses agree to 0.2 to 1.1 px at 430 px focal length, 0.03 to 0.15 deg.
-LOCAL_POSES = LoggedSigmas((0.005,) * 3, (0.15,) * 3, (0.003,) * 3, (0.1,) * 3)
 CLASS_OF_MODEL = {
     "EPISIM": SIMULATED,
     **dict.fromkeys(("FC300C", "FC300S", "FC300X", "FC300XW", "FC330", "FC350"), PHANTOM_3),
@@ -87,6 +84,12 @@ def drone_class(model: str, rtk_flag: int | None) -> DroneClass:
     """The class of a photo's drone; an unknown model that logs an RTK flag is a survey drone."""
     known = CLASS_OF_MODEL.get(model.strip())
     return known or (SURVEY if rtk_flag is not None and rtk_flag >= RTK_SINGLE else CONSUMER)
+
+
+def local_sigmas(position_m: float, attitude_deg: float) -> LoggedSigmas:
+    """Sigmas of poses in a frame of their own: all of the error is new in each; there is no place to be off from."""
+    position, attitude = (position_m,) * 3, (attitude_deg,) * 3
+    return LoggedSigmas(position, attitude, position, attitude)
 
 
 def widened(sigmas: LoggedSigmas, timing: TimingSigmas | None) -> LoggedSigmas:

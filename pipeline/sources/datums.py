@@ -35,8 +35,9 @@ class Heights:
 def own_datum(record: PhotoRecord) -> str:
     """What the best height of a photo is measured from; empty where it has none.
 
-    A log may say the ellipsoidal height itself, and a receiver with RTK logs ellipsoidal heights. Without either DJI's AbsoluteAltitude is of no certain datum (sea level by
-    barometer or by the receiver's geoid, metres to tens of metres apart), but the height above take-off is known.
+    A log may say the ellipsoidal height itself, and a receiver with RTK logs it. Without either DJI's AbsoluteAltitude
+    is of no certain datum (sea level by barometer or by the receiver's geoid, metres to tens of metres apart), but the
+    height above take-off is known.
     """
     if record.ellipsoidal_m is not None:
         return ELLIPSOIDAL
@@ -98,7 +99,7 @@ def _height(record: PhotoRecord, datum: str, *, automatic: bool) -> float | None
 def _ellipsoidal(
     records: Sequence[PhotoRecord], values: Sequence[float | None], geoid: Geoid
 ) -> tuple[float | None, ...]:
-    """Orthometric heights plus the geoid's; what a mark or a log says of the ellipsoid itself is ellipsoidal already."""
+    """Orthometric heights plus the geoid's; what a mark or a log says of the ellipsoid is ellipsoidal already."""
     rows = [
         row
         for row, (record, value) in enumerate(zip(records, values, strict=True))

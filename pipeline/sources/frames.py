@@ -18,7 +18,7 @@ from pipeline.geodesy.heights import ELLIPSOIDAL, LOCAL, TAKEOFF
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.rotations import enu_from_cam, gimbal_angles, quaternion_from_rotation
 from pipeline.sources import datums, exposures
-from pipeline.sources.accuracy import LOCAL_POSES, pose_sigmas, widened
+from pipeline.sources.accuracy import LoggedSigmas, pose_sigmas, widened
 from pipeline.sources.exposures import Exposures, MarkFile
 from pipeline.sources.files import relative_to
 from pipeline.sources.photos import PhotoRecord
@@ -54,6 +54,7 @@ def assemble(
     height_datum: str,
     geoid: float | str | None,
     clock_offset_s: float = 0.0,
+    local_sigmas: LoggedSigmas | None = None,
     log_clocks: Sequence[Mapping[str, Any]] = (),
 ) -> Ingested:
     """Puts photos, their exposure marks and what the logs said of them together.
@@ -65,6 +66,7 @@ def assemble(
         height_datum: As `datums.resolve`.
         geoid: As `datums.resolve`.
         clock_offset_s: Added to the photos' own times, s.
+        local_sigmas: Sigmas of poses in a local frame.
         log_clocks: Rows of `clocks` from the logs: their own clocks, and the cameras' against them.
 
     Raises:
@@ -90,7 +92,7 @@ def assemble(
             **{f"{axis}_m": enu[i, k] for k, axis in enumerate(_AXES) if np.isfinite(enu[i, k])},
             **{f"q{part}": quaternions[i, k] for k, part in enumerate("wxyz") if np.isfinite(quaternions[i, k])},
             **{f"{name}_deg": angles[i, k] for k, name in enumerate(_ANGLES) if np.isfinite(angles[i, k])},
-            **_sigmas(record, heights.datum),
+            **_sigmas(record, heights.datum, local_sigmas if record.local_m else None),
         }
         for i, record in enumerate(judged)
     ]
@@ -204,11 +206,10 @@ def _identity(record: PhotoRecord, camera_id: str, root: str, clock_offset_s: fl
     }
 
 
-def _sigmas(record: PhotoRecord, datum: str) -> dict[str, float]:
+def _sigmas(record: PhotoRecord, datum: str, stated: LoggedSigmas | None) -> dict[str, float]:
     if record.problem:
         return {}
-    logged = LOCAL_POSES if record.local_m else pose_sigmas(record.model, record.fix, datum)
-    sigmas = widened(logged, record.timing)
+    sigmas = widened(stated or pose_sigmas(record.model, record.fix, datum), record.timing)
     return {
         **{f"sigma_{axis}_m": sigmas.position_m[k] for k, axis in enumerate(_AXES)},
         **{f"sigma_{angle}_deg": sigmas.attitude_deg[k] for k, angle in enumerate(_ANGLES)},

@@ -1,0 +1,30 @@
+"""How a sensor sits on the vehicle, as the workflow states it."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from pipeline.tracks.mount import Mount
+
+
+class MountConfig(BaseModel):
+    """How a sensor sits on the vehicle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    yaw_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, 90 right (deg)")
+    pitch_deg: float | None = Field(default=None, description="Optical axis in the body: 0 forward, -90 down (deg)")
+    roll_deg: float | None = Field(default=None, description="About the optical axis, clockwise (deg)")
+    lever_arm_m: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="From the antenna, or what is posed, to the sensor: forward, right, down (m)",
+    )
+
+    def mount(self) -> Mount:
+        """As geometry; angles that are not stated are none where none is, and 0 beside others."""
+        angles = (self.yaw_deg, self.pitch_deg, self.roll_deg)
+        if all(angle is None for angle in angles):
+            return Mount(None, self.lever_arm_m)
+        yaw, pitch, roll = (float(np.radians(angle or 0.0)) for angle in angles)
+        return Mount((yaw, pitch, roll), self.lever_arm_m)

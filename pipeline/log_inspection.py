@@ -54,7 +54,7 @@ def describe_log(location: str) -> dict[str, Any]:
         "transforms": [f"{t.parent} > {t.child}" for t in log.transforms],
         "images": [
             {"stream": s.stream, "images": len(s.time_ns), "width_px": s.width, "height_px": s.height,
-             "encoding": s.encoding, "note": s.note}
+             "encoding": s.encoding, **({"note": s.note} if s.note else {})}
             for s in log.images
         ],
         "cameras": [

@@ -2,8 +2,8 @@
 
     python benchmarks/big_ingest.py FOLDER [DATAFLASH_BYTES MCAP_BYTES]
 
-The files are written into FOLDER where they are not there yet. Times of two commands in one run compare; alone they tell
-the machine. Memory is the resident size of all processes of a command together, the largest seen.
+The files are written into FOLDER where they are not there yet. Times of two commands in one run compare; alone they
+tell the machine. Memory is the resident size of all processes of a command together, the largest seen.
 """
 
 from __future__ import annotations

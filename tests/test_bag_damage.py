@@ -34,8 +34,8 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from pipeline.engine.errors import InputError
-from pipeline.sources.bag_payloads import read_images
-from pipeline.sources.bags import read_bag
+from pipeline.sources.bags.bag import read_bag
+from pipeline.sources.bags.payloads import read_images
 from pipeline.sources.records import FlightLog
 
 N = 40

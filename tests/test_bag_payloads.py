@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from rosbags.highlevel import AnyReader
 
 from pipeline.engine.errors import InputError
-from pipeline.sources.bag_payloads import read_images, read_sweeps
+from pipeline.sources.bags.payloads import read_images, read_sweeps
 from pipeline.sources.logs import read_log
 
 RNG = np.random.default_rng(3)

@@ -35,8 +35,9 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.rotations import ned_from_frd, rotation_from_quaternion
-from pipeline.sources import mcap_bag, rosbag
-from pipeline.sources.frame_tree import transform_between
+from pipeline.sources.bags import mcap as mcap_bag
+from pipeline.sources.bags import rosbag
+from pipeline.sources.bags.frame_tree import transform_between
 from pipeline.sources.logs import read_log
 from pipeline.sources.records import FixedTransform, FlightLog
 

@@ -23,9 +23,9 @@ from pipeline.simulation.flight import CONSUMER_DRONE, fly, logged_poses
 from pipeline.simulation.logs.dataflash import FIRMWARE, MESSAGES, dataflash
 from pipeline.simulation.recording import SIGMA_HORIZONTAL_M, Recording, record
 from pipeline.simulation.site import Site
-from pipeline.sources import dataflash_walk
-from pipeline.sources.dataflash import is_format, read
-from pipeline.sources.dataflash_fields import WANTED, Found
+from pipeline.sources.dataflash import walk as dataflash_walk
+from pipeline.sources.dataflash.fields import WANTED, Found
+from pipeline.sources.dataflash.reader import is_format, read
 from pipeline.sources.records import FlightLog
 
 REAL = "data/logs/ardupilot_bin/3.BIN"
@@ -582,7 +582,7 @@ def test_a_big_log_takes_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "big.BIN"
     write_dataflash(path, 60_000_000)
     program = (
-        "import resource, sys; import pymavlink.DFReader; from pipeline.sources.dataflash import read;"
+        "import resource, sys; import pymavlink.DFReader; from pipeline.sources.dataflash.reader import read;"
         "a = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss;"
         "log = read(sys.argv[1]); b = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss;"
         "print(b - a, sum(log.counts.values()), len(log.losses))"

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from pipeline.engine.errors import InputError
 from pipeline.geometry.rotations import ned_from_frd, rotation_from_quaternion
-from pipeline.sources import dji_csv, dji_txt
-from pipeline.sources.dji_columns import AIRDATA, DATCON, FLIGHT_RECORD, header_of, layout_of
+from pipeline.sources.dji_logs import csv_log as dji_csv
+from pipeline.sources.dji_logs import encrypted as dji_txt
+from pipeline.sources.dji_logs.columns import AIRDATA, DATCON, FLIGHT_RECORD, header_of, layout_of
 from pipeline.sources.records import FlightLog
 
 REAL = "data/logs/dji_csv/Jan-4th-2024-02-19PM-Flight-Airdata.csv"

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from pipeline.engine.errors import InputError
 from pipeline.geometry.rotations import ned_from_frd, rotation_from_quaternion
-from pipeline.sources import srt, srt_dialects
-from pipeline.sources.held import new_values, sloped, sloped_longitude
+from pipeline.sources.dji_logs import srt, srt_dialects
+from pipeline.sources.dji_logs.held import new_values, sloped, sloped_longitude
 from pipeline.sources.records import FlightLog
 
 # Cues of the real files as their collection tells them (an arrow line each).

@@ -21,11 +21,11 @@ from pipeline.simulation.flight import CONSUMER_DRONE, fly, logged_poses
 from pipeline.simulation.logs.tlog import tlog
 from pipeline.simulation.recording import SIGMA_HORIZONTAL_M, Recording, record
 from pipeline.simulation.site import Site
-from pipeline.sources import mavlink_frames
 from pipeline.sources.logs import read_log
-from pipeline.sources.mavlink_frames import Sender
+from pipeline.sources.mavlink import frames as mavlink_frames
+from pipeline.sources.mavlink.frames import Sender
+from pipeline.sources.mavlink.tlog import is_format, read
 from pipeline.sources.records import FlightLog
-from pipeline.sources.tlog import is_format, read
 
 REAL = "data/logs/ardupilot_tlog/flight.tlog"
 # The ground station's clock when the vehicle of the hand-made logs boots, us.

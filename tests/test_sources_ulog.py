@@ -16,8 +16,8 @@ from pipeline.simulation.flight import CONSUMER_DRONE, fly, logged_poses
 from pipeline.simulation.logs.ulog import ulog
 from pipeline.simulation.recording import EXTRA_TRIGGERS_S, Recording, record
 from pipeline.simulation.site import Site
+from pipeline.sources.px4.ulog import is_format, read
 from pipeline.sources.records import Attitudes, FlightLog, Positions
-from pipeline.sources.ulog import is_format, read
 
 REAL = ("foxglove/test_ulog.ulg", "pyulog/sample_log_small.ulg")
 MAGIC = b"ULog\x01\x12\x35\x01" + bytes(8)

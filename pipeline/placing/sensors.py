@@ -19,7 +19,7 @@ from pipeline.placing.pose import (
     vehicle_rotations,
 )
 from pipeline.placing.timeline import FRD_FROM_FLU, Timeline, root_of
-from pipeline.sources.frame_tree import transform_between
+from pipeline.sources.bags.frame_tree import transform_between
 from pipeline.sources.records import LocalPoses, Positions, SweepStream
 from pipeline.tracks.mount import Mount
 from pipeline.tracks.series import between, bracket, slerp
@@ -64,7 +64,9 @@ def _on_body(line: Timeline, sweeps: SweepStream, mount: Mount | None) -> tuple[
     body = (
         line.local.child if line.local is not None and line.local.child else root_of(line.log.transforms, sweeps.frame)
     )
-    found = transform_between(line.log.transforms, body, sweeps.frame)
+    known = {frame for transform in line.log.transforms for frame in (transform.parent, transform.child)}
+    # A frame that no transform names would be its own root, and the LiDAR would sit in the middle of the body.
+    found = transform_between(line.log.transforms, body, sweeps.frame) if sweeps.frame in known else None
     if found is None:
         raise UndeterminedError(
             "E-BAG-22", "nothing says how the LiDAR sits on the body", where=line.log.location,

@@ -16,7 +16,7 @@ from pipeline.placing.gather import Extracted, as_photo, calibration_of, image_s
 from pipeline.placing.place import Placed, place
 from pipeline.placing.sensors import sensor_poses
 from pipeline.placing.timeline import Timeline, timeline
-from pipeline.sources.bag_payloads import read_images, read_sweeps
+from pipeline.sources.bags.payloads import read_images, read_sweeps
 from pipeline.sources.calibration import read_calibration
 from pipeline.sources.exposures import MarkFile
 from pipeline.sources.files import MARK_SUFFIXES, beside, opened

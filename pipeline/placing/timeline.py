@@ -17,7 +17,7 @@ from pipeline.geometry.rotations import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
-from pipeline.sources.frame_tree import transform_between
+from pipeline.sources.bags.frame_tree import transform_between
 from pipeline.sources.records import Attitudes, Events, FixedTransform, FlightLog, LocalPoses, Positions
 from pipeline.tracks.mount import Mount
 

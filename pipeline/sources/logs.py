@@ -34,14 +34,14 @@ class Format:
 
 # Binary formats, which have a magic number, before texts.
 FORMATS = (
-    Format("pipeline.sources.dataflash", (".bin", ".log")),
-    Format("pipeline.sources.ulog", (".ulg",)),
-    Format("pipeline.sources.mcap_bag", (".mcap",)),
-    Format("pipeline.sources.rosbag", (".bag", ".db3")),
-    Format("pipeline.sources.tlog", (".tlog",)),
-    Format("pipeline.sources.dji_txt", (".txt",)),
-    Format("pipeline.sources.srt", (".srt",)),
-    Format("pipeline.sources.dji_csv", (".csv",)),
+    Format("pipeline.sources.dataflash.reader", (".bin", ".log")),
+    Format("pipeline.sources.px4.ulog", (".ulg",)),
+    Format("pipeline.sources.bags.mcap", (".mcap",)),
+    Format("pipeline.sources.bags.rosbag", (".bag", ".db3")),
+    Format("pipeline.sources.mavlink.tlog", (".tlog",)),
+    Format("pipeline.sources.dji_logs.encrypted", (".txt",)),
+    Format("pipeline.sources.dji_logs.srt", (".srt",)),
+    Format("pipeline.sources.dji_logs.csv_log", (".csv",)),
     Format("pipeline.sources.colmap", (".bin", ".txt")),
     Format("pipeline.sources.trajectory", (".tum", ".txt", ".csv")),
 )

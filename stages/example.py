@@ -9,15 +9,24 @@ import typer
 
 from pipeline.engine.executors import usable_cores
 from pipeline.simulation.example import write_example
+from pipeline.simulation.indoor import write_indoor
 
 
 def command(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write; absent or empty.")],
     frames: Annotated[int, typer.Option(help="Number of photos, at least 4.")] = 24,
     seed: Annotated[int, typer.Option(help="Seed of everything random; the same seed gives the same bytes.")] = 7,
+    indoor: Annotated[
+        bool, typer.Option("--indoor", help="A room with motion capture instead, as a ROS 2 bag.")
+    ] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; all cores by default.")] = None,
 ) -> None:
-    """Writes a synthetic flight: photos with DJI tags, LiDAR tiles, control points, the truth, and a workflow."""
+    """Writes a synthetic flight: photos with DJI tags, logs, LiDAR tiles, control points, the truth, and workflows."""
+    if indoor:
+        room = write_indoor(directory, seed, frames)
+        typer.echo(f"{directory}: {room.frames} images, {room.sweeps} LiDAR sweeps, {room.returns} returns")
+        typer.echo(f"next: epitransfer run {directory / 'workflow.toml'} --out RUN", err=True)
+        return
     workers = jobs or usable_cores()
     typer.echo(f"rendering {frames} photos on {workers} processors, some three seconds each", err=True)
     made = write_example(directory, frames, seed, workers)

@@ -241,7 +241,12 @@ def write_sweeps_of(context: Context, sources: Sequence[Source], origin: LocalFr
         if source.images is None or not log.sweeps or not source.line.places:
             continue
         stream = max(log.sweeps, key=lambda sweeps: sweeps.points)
-        poses = sensor_poses(source.line, stream, wishes.lidar_mount, origin, y_up=wishes.y_up)
+        try:
+            poses = sensor_poses(source.line, stream, wishes.lidar_mount, origin, y_up=wishes.y_up)
+        except UndeterminedError as error:
+            # Points do not need the sweeps; `score` will say that there is nothing to score against.
+            context.warn(f"the sweeps of {stream.stream} are left out: {error.message} ({error.hint})")
+            continue
         folder = context.output("sweeps") / f"bag-{number:02d}"
         written += write_sweeps(read_sweeps(log.location, stream.stream, log.time_base.epoch), poses, folder)
     return written

@@ -237,9 +237,9 @@ def test_unknown_encodings_and_schemas(tmp_path: Path) -> None:
     assert seconds(log) == [0, 1, 2]
     told = {loss.split(" ", 1)[0]: loss for loss in log.losses}
     assert told.keys() == {"/0", "/1", "/2", "/3", "/4"}
-    assert "2 messages not read: encoding 'flatbuffer'" in told["/1"]
-    assert "4 messages not read: encoding 'cbor'" in told["/3"]
-    assert "3 messages not read: schema 'foxglove.LocationFix'" in told["/2"]
+    assert "all 2 messages were left out: encoding 'flatbuffer'" in told["/1"]
+    assert "all 4 messages were left out: encoding 'cbor'" in told["/3"]
+    assert "all 3 messages were left out: schema 'foxglove.LocationFix'" in told["/2"]
     assert "without a definition" in told["/0"]
     assert log.counts == {"/0": 1, "/1": 2, "/2": 3, "/3": 4, "/4": 5, "/fix": 3}
 

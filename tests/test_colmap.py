@@ -163,7 +163,7 @@ def test_an_unknown_camera_is_told_and_the_pose_kept(tmp_path: Path) -> None:
     log = read_checked(tmp_path)
     assert log.poses[0].image == ("a.jpg", "b.jpg")
     assert log.facts["camera_of_image"] == {"a.jpg": "1"}
-    assert log.losses == ("1 images (b.jpg) name a camera that the model does not hold.",)
+    assert log.losses == ("1 images (b.jpg) name a camera that the model does not hold",)
 
 
 def test_a_model_cut_short_gives_the_images_before_the_cut(tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def test_fixes_that_are_none(tmp_path: Path) -> None:
     assert [(t - BEGAN_NS) // NS for t in positions.time_ns.tolist()] == [0, 1, 3, 4]
     assert positions.segment.tolist() == [0, 0, 1, 1]
     assert np.isnan(positions.sigma_horizontal_m).tolist() == [True, False, False, False]
-    assert log.losses == ("/fix: 2 of 6 messages without a fix left out",)
+    assert log.losses == ("/fix: 2 of 6 messages have no fix and were left out",)
 
 
 def test_without_stamps_log_time_counts(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_late_messages_take_their_place_and_impossible_times_go(tmp_path: Path) 
     seconds = [0.0, 0.2, 0.1, 0.3, 4e8, 0.4]
     log = content(tmp_path, [("/pose", at(0.5), pose(at(s), s)) for s in seconds])
     assert log.poses[0].position_m[:, 0].tolist() == [0.0, 0.1, 0.2, 0.3, 0.4]
-    assert log.losses == ("/pose: 1 messages left out, their times cannot be right",)
+    assert log.losses == ("/pose: 1 of 6 messages have an impossible time and were left out",)
 
 
 def test_an_imu_without_orientation(tmp_path: Path) -> None:
@@ -257,7 +257,7 @@ def test_an_imu_without_orientation(tmp_path: Path) -> None:
     rows += [("/zero", at(n), imu(at(n), (0.0, 0.0, 0.0, 0.0))) for n in range(3)]
     log = content(tmp_path, rows)
     assert log.attitudes == ()
-    assert log.losses == ("/zero: 3 of 3 messages hold no rotation and are left out",)
+    assert log.losses == ("/zero: 3 of 3 messages hold no rotation and were left out",)
 
 
 def test_an_imu_on_its_side_tells_the_bodys_attitude(tmp_path: Path) -> None:

@@ -160,11 +160,11 @@ def test_a_real_flight_restarts_once(shared: Path) -> None:
     offset_s = (log.time_base.anchor_utc_ns - log.time_base.anchor_log_ns) / 1e9
     assert np.ptp(offset_s) < 0.1
     assert abs(np.median(offset_s) - 1436056240.5) < 0.1
-    facts = {key: log.facts[key] for key in ("system", "autopilot", "vehicle", "mavlink_versions")}
+    facts = {key: log.facts[key] for key in ("system_id", "autopilot", "vehicle_type", "mavlink_versions")}
     assert facts == {
-        "system": 1,
+        "system_id": 1,
         "autopilot": "MAV_AUTOPILOT_ARDUPILOTMEGA",
-        "vehicle": "MAV_TYPE_QUADROTOR",
+        "vehicle_type": "MAV_TYPE_QUADROTOR",
         "mavlink_versions": [1],
     }
 
@@ -250,7 +250,7 @@ def test_two_vehicles_stay_apart(tmp_path: Path) -> None:
         link.gimbal(at_s, 64, (1.0, 0.0, 0.0, 0.0), (2, 154))
         link.gimbal(at_s, 64, (0.0, 1.0, 0.0, 0.0), (1, 154))
     log = link.read(tmp_path)
-    assert (log.facts["system"], log.facts["autopilot"]) == (2, "MAV_AUTOPILOT_PX4")
+    assert (log.facts["system_id"], log.facts["autopilot"]) == (2, "MAV_AUTOPILOT_PX4")
     assert np.unique(log.positions[0].latitude_deg).tolist() == [47.0]
     assert [(stream.stream, stream.q_wxyz[0, 0]) for stream in log.attitudes] == [
         ("GIMBAL_DEVICE_ATTITUDE_STATUS", 1.0)
@@ -268,7 +268,7 @@ def test_of_two_equal_vehicles_the_lower_number_is_read(tmp_path: Path) -> None:
         for system in (7, 3):
             link.heartbeat(step, (system, 1))
             link.position(step, (system, 1))
-    assert link.read(tmp_path).facts["system"] == 3
+    assert link.read(tmp_path).facts["system_id"] == 3
 
 
 def test_a_restart_is_another_boot(tmp_path: Path) -> None:
@@ -357,8 +357,8 @@ def test_a_gimbal_with_a_clock_of_its_own(tmp_path: Path) -> None:
         link.gimbal(10.0 + step * 0.2, 64, (1.0, 0.0, 0.0, 0.0), (1, 154), own_s=-8.25)
     log = link.read(tmp_path)
     assert np.max(np.abs(log.attitudes[1].time_ns / 1e9 - (10.0 + 0.2 * np.arange(120)))) < 0.02
-    assert "-8." not in log.facts["GIMBAL_DEVICE_ATTITUDE_STATUS clock"]
-    assert "8.2" in log.facts["GIMBAL_DEVICE_ATTITUDE_STATUS clock"]
+    assert "-8." not in log.facts["component_clocks"]["GIMBAL_DEVICE_ATTITUDE_STATUS"]
+    assert "8.2" in log.facts["component_clocks"]["GIMBAL_DEVICE_ATTITUDE_STATUS"]
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_a_bad_line_in_twenty_is_left_out_and_a_second_is_too_many(tmp_path: Pat
     good = [f"{1305031102 + n} 1 2 3 0 0 0 1" for n in range(19)]
     log = read_text(tmp_path, "\n".join([*good[:3], bad, *good[3:]]), "t.tum")
     assert len(log.poses[0].time_ns) == 19
-    assert log.losses == ("1 of 20 lines are no poses and were left out: 4.",)
+    assert log.losses == ("1 of 20 lines are no poses and were left out: 4",)
     with pytest.raises(InputError, match=r"E-TRAJ-01(.|\n)*t\.tum:4\n(.|\n)*2 of 20 lines are no poses"):
         read_text(tmp_path, "\n".join([*good[:3], bad, bad, *good[3:18]]), "t.tum")
 
@@ -79,7 +79,7 @@ def test_a_bad_line_in_twenty_is_left_out_and_a_second_is_too_many(tmp_path: Pat
 def test_a_cut_file_gives_the_lines_before_the_cut(tmp_path: Path) -> None:
     log = read_text(tmp_path, TUM[:-30], "t.tum")
     assert len(log.poses[0].time_ns) == 2
-    assert log.losses == ("1 of 3 lines are no poses and were left out: 5.",)
+    assert log.losses == ("1 of 3 lines are no poses and were left out: 5",)
 
 
 def test_a_csv_of_geodetic_positions_and_gimbal_angles(tmp_path: Path) -> None:

@@ -84,8 +84,8 @@ def test_description(video: Path) -> None:
     assert facts["codec"] in {"h264", "mpeg4"}
     assert np.array_equal(stream.time_ns, frame_times(str(video)))
     assert facts["frames"] == 75
-    assert facts["frame_rate"] == pytest.approx(74 / (TICKS[-1] / 30000), rel=1e-5)
-    assert facts["duration_s"] == pytest.approx(75 / facts["frame_rate"], rel=1e-5)
+    assert facts["frame_rate_hz"] == pytest.approx(74 / (TICKS[-1] / 30000), rel=1e-5)
+    assert facts["duration_s"] == pytest.approx(75 / facts["frame_rate_hz"], rel=1e-5)
     assert facts["rotation_deg"] == 0
     assert facts["creation_time"].startswith("2024-06-01T08:12:03")
 

@@ -23,6 +23,7 @@ from pipeline.geometry.rotations import rotation_from_quaternion
 from pipeline.sources.files import opened
 from pipeline.sources.intrinsics import checked
 from pipeline.sources.records import FlightLog, LocalPoses, LoggedCamera, TimeBase
+from pipeline.sources.streams import unit
 
 # COLMAP's numbers and names of its models.
 _NAMES = (
@@ -78,12 +79,12 @@ def read(location: str) -> FlightLog:
     images = _images(location, losses)
     unknown = [name for name, camera in zip(images.name, images.camera, strict=True) if camera not in cameras]
     if unknown:
-        losses.append(f"{len(unknown)} images ({', '.join(unknown[:3])}) name a camera that the model does not hold.")
+        losses.append(f"{len(unknown)} images ({', '.join(unknown[:3])}) name a camera that the model does not hold")
     return FlightLog(
         location=location,
         kind="COLMAP model",
         counts={"images": len(images.name), "cameras": len(cameras)},
-        time_base=TimeBase("boot", problem="A COLMAP model holds no times."),
+        time_base=TimeBase("boot", problem="no times in a COLMAP model"),
         poses=(_poses(location, images),),
         cameras=tuple(LoggedCamera(str(number), "", camera) for number, camera in cameras.items()),
         losses=tuple(losses),
@@ -117,7 +118,7 @@ class _Images:
 def _poses(location: str, images: _Images) -> LocalPoses:
     order = sorted(range(len(images.name)), key=images.name.__getitem__)
     pose = np.array(images.pose, np.float64)[order]
-    q_cam_from_world = pose[:, :4] / np.linalg.norm(pose[:, :4], axis=-1, keepdims=True)
+    q_cam_from_world = unit(pose[:, :4])
     cam_from_world = rotation_from_quaternion(q_cam_from_world)
     centre: Floats = -np.einsum("nji,nj->ni", cam_from_world, pose[:, 4:])
     zeros = np.zeros(len(order), np.int64)
@@ -153,7 +154,7 @@ def _cameras(folder: str, losses: list[str]) -> dict[int, Camera]:
             if error.code == _NO_EQUAL:
                 raise
             # Poses are worth having without their cameras: a calibration file may stand in.
-            losses.append(f"{location}: damaged behind {len(cameras)} cameras ({error.found}).")
+            losses.append(f"{Path(location).name} is damaged behind {len(cameras)} cameras: {error.found}")
     return cameras
 
 
@@ -224,10 +225,10 @@ def _image_records(stream: BinaryIO, location: str, losses: list[str]) -> _Image
         except (ValueError, InputError):
             # Records have no marks to find the next one by.
             if lost := promised - len(images.name):
-                losses.append(f"{location}: damaged or cut short; {lost} of {promised} images lost.")
+                losses.append(f"{Path(location).name} is damaged or cut short: {lost} of {promised} images lost")
             return images
     if stream.tell() < size:
-        losses.append(f"{location}: {size - stream.tell()} bytes behind the last image were left out.")
+        losses.append(f"{size - stream.tell()} bytes behind the last image of {Path(location).name} were left out")
     return images
 
 
@@ -251,7 +252,8 @@ def _image_lines(stream: BinaryIO, location: str, losses: list[str]) -> _Images:
         where, expected = f"{location}:{bad[0]}", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points"
         raise _wrong(where, f"{len(bad)} lines are no images", expected)
     if bad:
-        losses.append(f"{location}: lines {', '.join(map(str, bad[:10]))} are no images and were left out.")
+        lines = ", ".join(map(str, bad[:10]))
+        losses.append(f"{len(bad)} lines of {Path(location).name} are no images and were left out: {lines}")
     return images
 
 

@@ -6,7 +6,6 @@ says what ties that clock to UTC. Arrays of one record have one length n.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -14,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.cameras import Camera
 
 Nanoseconds = npt.NDArray[np.int64]
 
-NS_PER_S = 1_000_000_000
+NS_PER_S, NS_PER_MS, NS_PER_US = 1_000_000_000, 1_000_000, 1_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,55 +284,3 @@ class FlightLog:
 def nothing(n: int) -> Floats:
     """(n,) NaN: a quantity that the log does not hold."""
     return np.full(n, np.nan)
-
-
-def in_order(time_ns: Nanoseconds) -> Bools:
-    """Which samples to keep so that time never runs backwards: the longest such run, (n,).
-
-    One flipped bit far in the future would otherwise discard all that follows it.
-
-    Args:
-        time_ns: (n,).
-
-    Returns:
-        (n,) True for samples to keep; all True for what is in order already.
-
-    Source: Fredman, "On computing the length of longest increasing subsequences" (1975): patience sorting.
-    """
-    n = len(time_ns)
-    kept = np.ones(n, np.bool_)
-    if n < 2 or bool(np.all(np.diff(time_ns) >= 0)):
-        return kept
-    tails: list[int] = []
-    ends: list[int] = []
-    before = np.full(n, -1, np.int64)
-    for index, value in enumerate(time_ns.tolist()):
-        place = bisect_right(tails, value)
-        before[index] = ends[place - 1] if place else -1
-        if place == len(tails):
-            tails.append(value)
-            ends.append(index)
-        else:
-            tails[place], ends[place] = value, index
-    kept[:] = False
-    at = ends[-1]
-    while at >= 0:
-        kept[at] = True
-        at = int(before[at])
-    return kept
-
-
-def segments(time_ns: Nanoseconds, counters: Ints | None = None) -> Ints:
-    """Segment numbers, (n,): a new one wherever a reset counter changes.
-
-    Args:
-        time_ns: (n,), for its length.
-        counters: (n,) reset counter of each sample, or None for one segment.
-
-    Returns:
-        (n,).
-    """
-    out = np.zeros(len(time_ns), np.int64)
-    if counters is not None and len(time_ns) > 1:
-        out[1:] = np.cumsum(np.diff(counters) != 0)
-    return out

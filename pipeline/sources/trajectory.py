@@ -26,7 +26,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from itertools import chain
 from pathlib import PurePosixPath
@@ -39,12 +39,23 @@ from pipeline.geometry.rotations import (
     ENU_FROM_NED,
     FRD_FROM_RDF,
     enu_from_cam,
-    ned_from_frd,
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
 from pipeline.sources.files import opened
-from pipeline.sources.records import Attitudes, FlightLog, LocalPoses, Nanoseconds, Positions, TimeBase, nothing
+from pipeline.sources.records import (
+    NS_PER_S,
+    NS_PER_US,
+    Attitudes,
+    FlightLog,
+    LocalPoses,
+    Nanoseconds,
+    Positions,
+    TimeBase,
+    nothing,
+)
+from pipeline.sources.streams import ned_quaternions, unit
+from pipeline.sources.time_bases import UTC_FROM_NS, unix_us
 
 _TUM_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _GEODETIC = ("latitude_deg", "longitude_deg")
@@ -58,9 +69,8 @@ _LONGEST_LINE = 1 << 16
 # Eight hours at 100 Hz.
 _MOST_ROWS = 3_000_000
 _MOST_BAD_SHARE = 0.05
-# Seconds beyond which a clock counts from 1970 (2001), and beyond which it does not count in seconds (2255).
-_UNIX_FROM_S, _UNIX_TO_S = 1e9, 9e9
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+# The year 2255: larger numbers do not count in seconds.
+_UNIX_TO_S = 9e9
 _NOT_UNIT = 0.01
 
 
@@ -141,8 +151,8 @@ class _Table:
     def base(self) -> TimeBase:
         """What the times count from."""
         if not self.timed:
-            return TimeBase("boot", problem="The file holds image names and no times.")
-        unix = float(np.median(self.time_ns)) > _UNIX_FROM_S * 1e9
+            return TimeBase("boot", problem="no times in the file, image names only")
+        unix = float(np.median(self.time_ns)) > UTC_FROM_NS
         source = "seconds since 1970, or ISO 8601" if unix else "seconds from a start that the file does not tell"
         return TimeBase("utc" if unix else "boot", source=source)
 
@@ -281,7 +291,7 @@ def _collect(
     image = tuple(rows.image[index] for index in order) if rows.image else ()
     _check_names(location, image)
     told = ", ".join(bad[:10]) + (", ..." if len(bad) > 10 else "")
-    losses = (f"{len(bad)} of {count} lines are no poses and were left out: {told}.",) if bad else ()
+    losses = (f"{len(bad)} of {count} lines are no poses and were left out: {told}",) if bad else ()
     time_ns = np.frombuffer(rows.time_ns, np.int64)[order]
     return _Table(columns, values, time_ns, bool(np.any(time_ns)) or not image, image, losses)
 
@@ -317,18 +327,18 @@ def _time_ns(text: str) -> int:
         instant = datetime.fromisoformat(text)
         if instant.tzinfo is None:
             raise ValueError(f"time {text[:40]} without its zone") from None
-        return (instant - _EPOCH) // timedelta(microseconds=1) * 1000
+        return unix_us(instant) * NS_PER_US
     if not 0.0 <= seconds < _UNIX_TO_S:
         raise ValueError(f"time {text[:40]} is not in seconds")
     try:
         # A double holds seconds since 1970 to a quarter of a microsecond only.
-        return round(Decimal(text.replace("_", "")) * 1_000_000_000)
+        return round(Decimal(text.replace("_", "")) * NS_PER_S)
     except InvalidOperation:
-        return round(seconds * 1e9)
+        return round(seconds * NS_PER_S)
 
 
 def _of_tum(location: str, table: _Table) -> FlightLog:
-    poses = _poses(location, table, _unit(table.of("qw", "qx", "qy", "qz")))
+    poses = _poses(location, table, unit(table.of("qw", "qx", "qy", "qz")))
     return FlightLog(location, "TUM trajectory", {"poses": len(table.values)}, table.base(), poses=(poses,),
                      losses=table.losses)  # fmt: skip
 
@@ -345,7 +355,7 @@ def _of_csv(location: str, table: _Table) -> FlightLog:
 
 def _world_from_cam(table: _Table) -> Floats:
     if "qw" in table.columns:
-        return _unit(table.of(*_QUATERNION))
+        return unit(table.of(*_QUATERNION))
     return quaternion_from_rotation(enu_from_cam(*np.radians(table.of(*_ANGLES)).T))
 
 
@@ -367,19 +377,13 @@ def _positions(location: str, table: _Table) -> Positions:
 
 def _attitudes(location: str, table: _Table) -> tuple[Attitudes, ...]:
     if "qw" in table.columns:
-        enu = rotation_from_quaternion(_unit(table.of(*_QUATERNION)))
-        ned = ENU_FROM_NED.T @ enu @ FRD_FROM_RDF.T
+        enu = rotation_from_quaternion(unit(table.of(*_QUATERNION)))
+        q_wxyz = quaternion_from_rotation(ENU_FROM_NED.T @ enu @ FRD_FROM_RDF.T)
     elif "yaw_deg" in table.columns:
-        ned = ned_from_frd(*np.radians(table.of(*_ANGLES)).T)
+        q_wxyz = ned_quaternions(*np.radians(table.of(*_ANGLES)).T)
     else:
         return ()
-    q_wxyz = quaternion_from_rotation(ned)
     return (Attitudes(_name(location), table.time_ns, q_wxyz, "gimbal", "ned", _one_segment(table), image=table.image),)
-
-
-def _unit(q: Floats) -> Floats:
-    out: Floats = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return out
 
 
 def _one_segment(table: _Table) -> Ints:

@@ -58,7 +58,7 @@ def describe_video(location: str) -> tuple[ImageStream, dict[str, Any]]:
 
     Returns:
         The stream, its times counted from the first frame shown, as subtitles count them; and facts: "duration_s",
-        "frame_rate" (mean, Hz), "frames", "width", "height", "codec", "creation_time" (as the file says; DJI writes
+        "frame_rate_hz" (mean), "frames", "width", "height", "codec", "creation_time" (as the file says; DJI writes
         local time there and calls it UTC), "rotation_deg" (what a player would turn it by, counter-clockwise; not
         applied here).
 
@@ -73,7 +73,7 @@ def describe_video(location: str) -> tuple[ImageStream, dict[str, Any]]:
         context = stream.codec_context
         facts = {
             "duration_s": float(time_ns[-1] + mean_ns) / NS_PER_S,
-            "frame_rate": float(NS_PER_S / mean_ns) if mean_ns else 0.0,
+            "frame_rate_hz": float(NS_PER_S / mean_ns) if mean_ns else 0.0,
             "frames": len(time_ns),
             "width": context.width,
             "height": context.height,

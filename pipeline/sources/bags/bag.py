@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from pipeline.sources.bags import mcap_file, rosbag1_file, rosbag2_files
 from pipeline.sources.bags.container import Bag, Raw, Topic, unreadable
 from pipeline.sources.bags.decoders import ENCODINGS, Decoder, UndecodableError, decoder
+from pipeline.sources.bags.flight_log import flight_log
 from pipeline.sources.bags.messages import BagMessages, is_wanted
-from pipeline.sources.bags.records_of import records_of
 from pipeline.sources.files import explained, is_url, local_copy
 from pipeline.sources.records import FlightLog
 
@@ -82,7 +82,7 @@ class _Decoding:
 
     def losses(self, bag: Bag) -> list[str]:
         out = [
-            f"{name} ({bag.types.get(name) or 'no type'}): {bag.counted[name]} messages not read: {why}"
+            f"{name} ({bag.types.get(name) or 'no type'}): all {bag.counted[name]} messages were left out: {why}"
             for name, why in self.unknown.items()
         ]
         out += [
@@ -99,7 +99,7 @@ def read_bag(location: str) -> FlightLog:
         location: As `open_bag`.
 
     Returns:
-        What it holds; images and points are read later, by `bag_payloads`.
+        What it holds; images and points are read later, by `payloads`.
 
     Raises:
         InputError: It is not there, no bag, or holds no message.
@@ -111,22 +111,4 @@ def read_bag(location: str) -> FlightLog:
             decoding.add(messages, topic, log_ns, data)
     if not bag.counted.total():
         raise unreadable(location, "; ".join(bag.losses) or "no message", "a bag with messages")
-    content = records_of(messages)
-    topics = dict(sorted(bag.types.items()))
-    facts: dict[str, Any] = {**bag.facts, "duration_s": bag.duration_s, "topics": topics, **content.facts}
-    return FlightLog(
-        location=location,
-        kind=bag.kind,
-        counts=dict(sorted(bag.counted.items())),
-        time_base=content.time_base,
-        positions=content.positions,
-        attitudes=content.attitudes,
-        events=content.events,
-        poses=content.poses,
-        transforms=content.transforms,
-        images=content.images,
-        cameras=content.cameras,
-        sweeps=content.sweeps,
-        losses=(*bag.losses, *decoding.losses(bag), *content.losses),
-        facts=facts,
-    )
+    return flight_log(messages, bag, location, decoding.losses(bag))

@@ -10,15 +10,15 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.sources.records import NS_PER_S, Nanoseconds, in_order
+from pipeline.sources.records import NS_PER_S, Nanoseconds
+from pipeline.sources.streams import in_order
+from pipeline.sources.time_bases import UTC_FROM_NS
 
-# Stamps below are of a simulator, or of a clock that counts from the machine's start; 1e9 s is September 2001.
-UTC_FROM_NS = 1_000_000_000 * NS_PER_S
 # A message this far from its neighbours in the file is not merely late.
 _LATE_NS = 10 * NS_PER_S
 
 
-class Samples:
+class Columns:
     """Header stamps, log times and numbers of one stream.
 
     Args:
@@ -73,7 +73,7 @@ class Timed:
     dropped: int
 
 
-def epoch_of(streams: Iterable[Samples]) -> Literal["utc", "boot"]:
+def epoch_of(streams: Iterable[Columns]) -> Literal["utc", "boot"]:
     """Whether a bag's times count from 1970: by the stamps of most streams, by log times where no message has one."""
     utc = boot = logged = 0
     for samples in streams:
@@ -96,7 +96,7 @@ def of_epoch(time_ns: Nanoseconds | int, epoch: Literal["utc", "boot"]) -> Bools
     return np.asarray((np.asarray(time_ns) >= UTC_FROM_NS) == (epoch == "utc"))
 
 
-def timed(samples: Samples, epoch: Literal["utc", "boot"], good: Bools | None = None) -> Timed:
+def timed(samples: Columns, epoch: Literal["utc", "boot"], good: Bools | None = None) -> Timed:
     """A stream by its header stamps; by log times where stamps are missing or of another clock than the bag's.
 
     Args:
@@ -128,7 +128,7 @@ def _note(stamps: Nanoseconds, stamped: Bools) -> str:
 
 
 def _near(time_ns: Nanoseconds) -> Bools:
-    """Samples whose time fits those around them in the file."""
+    """Columns whose time fits those around them in the file."""
     kept = in_order(time_ns)
     if np.all(kept):
         return kept

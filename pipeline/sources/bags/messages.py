@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.engine.errors import InputError
 from pipeline.geometry.cameras import Camera
 from pipeline.sources.bags.cameras import camera_of_message, either
-from pipeline.sources.bags.columns import Samples
+from pipeline.sources.bags.columns import Columns
 from pipeline.sources.bags.container import Topic
 from pipeline.sources.records import NS_PER_S
 
@@ -32,7 +32,7 @@ class Payloads:
         points: In all sweeps.
     """
 
-    samples: Samples
+    samples: Columns
     frame: str
     encoding: str = ""
     width: int = 0
@@ -52,7 +52,7 @@ class Calibration:
         changes: Messages that say something else than the first.
     """
 
-    samples: Samples
+    samples: Columns
     frame: str
     first: Camera | str | None
     changes: int = 0
@@ -76,17 +76,17 @@ class BagMessages:
         triggers: By topic.
     """
 
-    fixes: dict[str, Samples] = field(default_factory=dict)
+    fixes: dict[str, Columns] = field(default_factory=dict)
     lost_fixes: Counter[str] = field(default_factory=Counter)
-    attitudes: dict[tuple[str, str], Samples] = field(default_factory=dict)
-    poses: dict[Edge, Samples] = field(default_factory=dict)
-    edges: dict[Edge, Samples] = field(default_factory=dict)
+    attitudes: dict[tuple[str, str], Columns] = field(default_factory=dict)
+    poses: dict[Edge, Columns] = field(default_factory=dict)
+    edges: dict[Edge, Columns] = field(default_factory=dict)
     static: dict[Edge, tuple[float, ...]] = field(default_factory=dict)
     static_changes: Counter[Edge] = field(default_factory=Counter)
     images: dict[str, Payloads] = field(default_factory=dict)
     sweeps: dict[str, Payloads] = field(default_factory=dict)
     calibrations: dict[str, Calibration] = field(default_factory=dict)
-    triggers: dict[str, Samples] = field(default_factory=dict)
+    triggers: dict[str, Columns] = field(default_factory=dict)
 
     def add(self, topic: Topic, log_ns: int, message: Any) -> None:
         """Takes a message of a wanted topic.
@@ -101,7 +101,7 @@ class BagMessages:
         """
         _TAKE[kind_of(topic.type)](self, topic.name, log_ns, message)
 
-    def streams(self) -> list[Samples]:
+    def streams(self) -> list[Columns]:
         """All columns that have times."""
         out = [*self.fixes.values(), *self.attitudes.values(), *self.poses.values(), *self.edges.values()]
         out += self.triggers.values()
@@ -164,7 +164,7 @@ def _sigmas(message: Any) -> tuple[float, float]:
 
 
 def _fix(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
-    samples = to.fixes.setdefault(topic, Samples(6))
+    samples = to.fixes.setdefault(topic, Columns(6))
     status = getattr(message, "status", None)
     latitude, longitude = float(message.latitude), float(message.longitude)
     placed = abs(latitude) <= 90.0 and abs(longitude) <= 180.0
@@ -179,7 +179,7 @@ def _fix(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
 def _imu(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
     # A driver without an orientation says so by a covariance of -1 (sensor_msgs/Imu).
     if float(message.orientation_covariance[0]) != -1.0:
-        samples = to.attitudes.setdefault((topic, frame_of(message)), Samples(4))
+        samples = to.attitudes.setdefault((topic, frame_of(message)), Columns(4))
         samples.add(stamp_ns(message), log_ns, _wxyz(message.orientation))
 
 
@@ -187,14 +187,14 @@ def _pose(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
     pose = getattr(message.pose, "pose", message.pose)
     key = topic, frame_of(message), _frame(getattr(message, "child_frame_id", ""))
     values = (*_xyz(pose.position), *_wxyz(pose.orientation))
-    to.poses.setdefault(key, Samples(7)).add(stamp_ns(message), log_ns, values)
+    to.poses.setdefault(key, Columns(7)).add(stamp_ns(message), log_ns, values)
 
 
 def _transform(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
     """A transform on its own: motion capture."""
     key = topic, frame_of(message), _frame(message.child_frame_id)
     values = (*_xyz(message.transform.translation), *_wxyz(message.transform.rotation))
-    to.poses.setdefault(key, Samples(7)).add(stamp_ns(message), log_ns, values)
+    to.poses.setdefault(key, Columns(7)).add(stamp_ns(message), log_ns, values)
 
 
 def _tree(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
@@ -212,13 +212,13 @@ def _edge(to: BagMessages, topic: str, log_ns: int, edge: Any) -> None:
         to.static_changes[key] += to.static.get(key, values) != values
         to.static[key] = values
     else:
-        to.edges.setdefault(key, Samples(7)).add(stamp_ns(edge), log_ns, values)
+        to.edges.setdefault(key, Columns(7)).add(stamp_ns(edge), log_ns, values)
 
 
 def _image(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
     if topic not in to.images:
         size = int(getattr(message, "width", 0)), int(getattr(message, "height", 0))
-        to.images[topic] = Payloads(Samples(0), frame_of(message), str(either(message, "encoding", "format")), *size)
+        to.images[topic] = Payloads(Columns(0), frame_of(message), str(either(message, "encoding", "format")), *size)
     to.images[topic].samples.add(stamp_ns(message), log_ns)
 
 
@@ -231,7 +231,7 @@ def _sweep(to: BagMessages, topic: str, log_ns: int, message: Any) -> None:
         points = size // max(int(message.point_stride), 1)
     if topic not in to.sweeps:
         fields = tuple(str(item.name) for item in message.fields)
-        to.sweeps[topic] = Payloads(Samples(0), frame_of(message), fields=fields)
+        to.sweeps[topic] = Payloads(Columns(0), frame_of(message), fields=fields)
     to.sweeps[topic].samples.add(stamp_ns(message), log_ns)
     to.sweeps[topic].points += points
 
@@ -242,7 +242,7 @@ def _calibration(to: BagMessages, topic: str, log_ns: int, message: Any) -> None
         found = camera_of_message(message)
     except InputError as error:
         found = f"{error.message}: {error.found}"
-    known = to.calibrations.setdefault(topic, Calibration(Samples(0), frame_of(message), found))
+    known = to.calibrations.setdefault(topic, Calibration(Columns(0), frame_of(message), found))
     known.samples.add(stamp_ns(message), log_ns)
     known.changes += found != known.first
 
@@ -251,7 +251,7 @@ def _time_reference(to: BagMessages, topic: str, log_ns: int, message: Any) -> N
     """Of a trigger line; others tell the time and no more."""
     said = f"{topic} {message.source}".lower()
     if "trigger" in said or "camera" in said:
-        to.triggers.setdefault(topic, Samples(0)).add(stamp_ns(message), log_ns)
+        to.triggers.setdefault(topic, Columns(0)).add(stamp_ns(message), log_ns)
 
 
 _TAKE: dict[str, Callable[[BagMessages, str, int, Any], None]] = {

@@ -13,7 +13,7 @@ from pipeline.sources.bags.decoders import Decoder, UndecodableError, decoder
 from pipeline.sources.bags.images import UnknownEncodingError, image_file
 from pipeline.sources.bags.messages import kind_of, stamp_ns
 from pipeline.sources.bags.points import points_of_message
-from pipeline.sources.bags.video import VideoDecoder
+from pipeline.sources.bags.video_packets import VideoDecoder
 from pipeline.sources.records import Sweep
 
 _VIDEO = "foxglove/CompressedVideo"
@@ -88,6 +88,7 @@ def read_sweeps(location: str, stream: str, epoch: Literal["utc", "boot"] | None
             raise InputError(
                 "E-BAG-04", "LiDAR points without coordinates", where=f"{location} {stream}",
                 found=", ".join(names) or "no fields", expected="fields x, y, z",
+                hint="name another topic, or leave the sweeps out",
             )  # fmt: skip
         try:
             stamp = stamp_ns(message)
@@ -132,6 +133,7 @@ def _missing(bag: Bag, location: str, stream: str, kinds: Collection[str]) -> In
     return InputError(
         "E-BAG-03", "the bag has no such images or sweeps", where=location, found=f"no readable topic {stream}",
         expected=", ".join(topics) or "a topic of one of the types " + ", ".join(kinds),
+        hint="name a topic that `epitransfer inspect` lists, or record it anew",
     )  # fmt: skip
 
 

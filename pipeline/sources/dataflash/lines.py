@@ -83,6 +83,7 @@ class _Lines:
                 "the DataFlash log holds no message",
                 where=where,
                 found="no whole FMT line",
+                expected="a line FMT before the first of each message",
                 hint="download the log again from the vehicle",
             )
         if self.bad:

@@ -11,21 +11,18 @@ from pipeline.clocks.gps import utc_ns_from_gps
 from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.sources.dataflash.fields import Found
 from pipeline.sources.dataflash.samples import Samples, nearest, samples
-from pipeline.sources.records import NS_PER_S, TimeBase, nothing
+from pipeline.sources.records import NS_PER_MS, NS_PER_S, TimeBase, nothing
+from pipeline.sources.streams import FIX_3D, LARGEST_SEPARATION_M, is_place
+from pipeline.sources.time_bases import boot_time_base
 
-_FIX_3D = 3
 # GPA is written with its GPS message, under the same time.
 _SAME_NS = NS_PER_S // 2
-# Geoid and ellipsoid are nowhere further apart (EGM 2008: -107 .. 86 m); more is another unit, or no such height.
-_LARGEST_SEPARATION_M = 120.0
 # INT32_MIN stands for "unknown"; in centimetres it is this in metres.
 _UNKNOWN_M = -1e6
 # Accuracies are unsigned centimetres: 0 where the receiver says nothing, 65535 where they do not fit.
 _LARGEST_ACCURACY_M = 655.0
 # A sample is logged soon after it came.
 _LONGEST_WAY_S = 1.0
-# Drift of the vehicle's clock during a flight is far below; more is a damaged week or time.
-_LARGEST_CHANGE_NS = 2 * NS_PER_S
 _MOST_SANE = 0.9
 
 
@@ -49,11 +46,6 @@ class Receiver:
     sigma_vertical_m: Floats
     sample_s: Floats
 
-    @property
-    def separation_m(self) -> Floats:
-        """(n,) of the ellipsoid from the receiver's own mean sea level, NaN where not logged."""
-        return self.ellipsoidal_m - self.fixes.first("Alt")
-
 
 def receivers(found: Found) -> list[Receiver]:
     """The receivers of a log, the primary first.
@@ -68,20 +60,13 @@ def receivers(found: Found) -> list[Receiver]:
     for name, accuracy in (("GPS", "GPA"), ("GPS2", "GPA2")):
         accuracies = samples(found, accuracy, ())
         for stream in samples(found, name, ("Status", "Lat", "Lng")):
-            fixed = stream.columns["Status"] >= _FIX_3D
+            fixed = stream.columns["Status"] >= FIX_3D
             placed = is_place(stream.columns["Lat"], stream.columns["Lng"])
             if not (fixed & placed).any():
                 found.losses.append(f"no GPS fix in {stream.stream}")
                 continue
             own = next((s for s in accuracies if s.instance == stream.instance), None)
             out.append(_receiver(stream, fixed & placed, own, found.losses))
-    return out
-
-
-def is_place(latitude_deg: Floats, longitude_deg: Floats) -> Bools:
-    """Which coordinates are a place on earth; zeros are logged before there is a position."""
-    inside = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
-    out: Bools = inside & ((latitude_deg != 0.0) | (longitude_deg != 0.0))
     return out
 
 
@@ -100,11 +85,11 @@ def _receiver(stream: Samples, good: Bools, accuracy: Samples | None, losses: li
     # Older firmware logged Und, which is the height above sea level minus the one above the ellipsoid.
     above_m, undulation_m = told("AEl", _UNKNOWN_M, np.inf), told("Und", _UNKNOWN_M, np.inf)
     ellipsoidal_m = np.where(np.isfinite(above_m), above_m, fixes.first("Alt") - undulation_m)
-    far = np.abs(ellipsoidal_m - fixes.first("Alt")) > _LARGEST_SEPARATION_M
+    far = np.abs(ellipsoidal_m - fixes.first("Alt")) > LARGEST_SEPARATION_M
     if far.any():
         losses.append(
             f"{np.count_nonzero(far)} heights above the ellipsoid of {fixes.stream} are more than "
-            f"{_LARGEST_SEPARATION_M:.0f} m from its height above sea level and were left out"
+            f"{LARGEST_SEPARATION_M:.0f} m from its height above sea level and were left out"
         )
     sample_s = told("SMS", 0.0, np.inf) / 1e3
     way_s = fixes.time_ns / NS_PER_S - sample_s
@@ -151,10 +136,7 @@ def time_base(seen: Sequence[Receiver]) -> TimeBase:
             continue
         log_ns = fixes.time_ns[good]
         if by_sample:
-            log_ns = np.rint(receiver.sample_s[good] * 1e3).astype(np.int64) * 1_000_000
-        utc_ns = utc_ns[good]
-        change_ns = utc_ns - log_ns
-        near = np.abs(change_ns - np.int64(np.median(change_ns))) <= _LARGEST_CHANGE_NS
+            log_ns = np.rint(receiver.sample_s[good] * 1e3).astype(np.int64) * NS_PER_MS
         source = f"{fixes.stream} ({'GPA.SMS' if by_sample else 'as written'})"
-        return TimeBase("boot", log_ns[near], utc_ns[near], late=True, source=source)
+        return boot_time_base(log_ns, utc_ns[good], source, late=True)
     return TimeBase("boot", problem="boot time only: no GPS time in the log")

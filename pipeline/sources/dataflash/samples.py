@@ -9,11 +9,12 @@ import numpy as np
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.sources.dataflash.fields import Found
-from pipeline.sources.records import NS_PER_S, Nanoseconds, in_order, nothing
+from pipeline.sources.records import NS_PER_MS, NS_PER_S, NS_PER_US, Nanoseconds, nothing
+from pipeline.sources.streams import in_order
 
 # Times since boot, and what makes nanoseconds of them; GPS.T is the old firmware's "milliseconds since boot" where
 # its TimeMS is that of the GPS week.
-_CLOCKS = (("TimeUS", 1_000), ("T", 1_000_000), ("TimeMS", 1_000_000))
+_CLOCKS = (("TimeUS", NS_PER_US), ("T", NS_PER_MS), ("TimeMS", NS_PER_MS))
 # No vehicle runs for as long without a boot: 30 years.
 _LATEST_NS = 30 * 366 * 86_400 * NS_PER_S
 # Messages are written by several threads, and a camera's feedback is dated back: so much disorder is no damage.
@@ -123,23 +124,3 @@ def nearest(time_ns: Nanoseconds, wanted_ns: Nanoseconds, within_ns: int) -> Int
     closer = np.abs(time_ns[before] - wanted_ns) <= np.abs(time_ns[after] - wanted_ns)
     index = np.where(closer, before, after)
     return np.where(np.abs(time_ns[index] - wanted_ns) <= within_ns, index, -1).astype(np.int64)
-
-
-def between(time_ns: Nanoseconds, values: Floats, wanted_ns: Nanoseconds, *, beyond: bool) -> Floats:
-    """Values at other instants, interpolated, (m,).
-
-    Args:
-        time_ns: (n,) in order.
-        values: (n,); those that are NaN are passed over.
-        wanted_ns: (m,).
-        beyond: Whether the first and last value hold before and after; NaN there otherwise.
-
-    Returns:
-        (m,) NaN where there is nothing to interpolate.
-    """
-    known = np.isfinite(values)
-    if not known.any():
-        return nothing(len(wanted_ns))
-    x, y = time_ns[known].astype(np.float64), values[known]
-    ends = {} if beyond else {"left": np.nan, "right": np.nan}
-    return np.asarray(np.interp(wanted_ns.astype(np.float64), x, y, **ends), np.float64)

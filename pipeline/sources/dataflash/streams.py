@@ -9,26 +9,30 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.arrays import Floats, Ints
-from pipeline.geometry.rotations import ned_from_frd, quaternion_from_rotation
 from pipeline.sources.dataflash.fields import Found
-from pipeline.sources.dataflash.receivers import Receiver, is_place
-from pipeline.sources.dataflash.samples import Samples, between, samples
-from pipeline.sources.records import NS_PER_S, Attitudes, Events, Nanoseconds, Positions, nothing, segments
+from pipeline.sources.dataflash.receivers import Receiver
+from pipeline.sources.dataflash.samples import Samples, samples
+from pipeline.sources.records import NS_PER_S, Attitudes, Events, Nanoseconds, Positions, nothing
+from pipeline.sources.streams import (
+    FEEDBACK_SIGMA_S,
+    TRIGGER_SIGMA_S,
+    borrowed,
+    interpolated,
+    is_place,
+    ned_quaternions,
+    segments,
+    separation_m,
+)
 
 # Nothing that flies photos moves so far between two samples: the filter was reset.
 _JUMP_M, _JUMP_WITHIN_NS = 50.0, NS_PER_S
 # A silence of several samples is a gap, not a slow rate.
 _GAP_NS, _GAP_SAMPLES = 2 * NS_PER_S, 5
 _METRES_PER_DEGREE = 111_320.0
-# Rotations are made of so many samples at a time: they take ten times the memory of their quaternions.
-_AT_ONCE = 1 << 16
 # Firmware that looked at the feedback pin 50 times a second did not log the image's number yet; later the pin raises an
 # interrupt.
 _TICK_NS, _TICK_TOLERANCE_NS, _FEWEST_TICKS = 20_000_000, 500_000, 5
 _TICK_SIGMA_S = 0.020 / math.sqrt(12.0)
-_FEEDBACK_SIGMA_S = 0.001
-# From the command to the exposure: the camera's lag, which the log does not hold.
-_COMMAND_SIGMA_S = 0.05
 # CAM_FEEDBACK_PIN; since firmware 4.3 CAM1_FEEDBAK_PIN, CAM2_FEEDBAK_PIN.
 _PINS = ("_FEEDBACK_PIN", "_FEEDBAK_PIN")
 
@@ -51,11 +55,11 @@ def read_streams(
     vehicle = samples(found, "ATT", ("Roll", "Pitch", "Yaw"))
     gimbals = samples(found, "MNT", ("Roll", "Pitch"))
     backup = samples(found, "AHR2", ("Roll", "Pitch", "Yaw", "Lat", "Lng")) if not (navigation and vehicle) else []
-    positions = [_navigation(stream, seen, barometer, fused=True) for stream in navigation]
-    positions += [_fixes(receiver, barometer) for receiver in seen]
+    fixes = [_fixes(receiver, barometer) for receiver in seen]
+    positions = [_navigation(stream, fixes, barometer, fused=True) for stream in navigation] + fixes
     if not navigation:
         # Dead reckoning of the backup is not to be preferred to a receiver.
-        positions += [_navigation(stream, seen, barometer, fused=False) for stream in _placed(backup)]
+        positions += [_navigation(stream, fixes, barometer, fused=False) for stream in _placed(backup)]
     attitudes = [_turned(stream, "Yaw", "vehicle", "ned") for stream in vehicle or backup]
     shot_ns = [stream.time_ns for streams in shots.values() for stream in streams]
     for stream in gimbals:
@@ -71,31 +75,20 @@ def _placed(streams: Sequence[Samples]) -> list[Samples]:
     return [stream for stream in placed if len(stream.time_ns)]
 
 
-def _navigation(stream: Samples, seen: Sequence[Receiver], barometer: Samples | None, *, fused: bool) -> Positions:
+def _navigation(stream: Samples, fixes: Sequence[Positions], barometer: Samples | None, *, fused: bool) -> Positions:
     """A filter's positions, on the ellipsoid by the separation that the receiver itself applies."""
     time_ns, amsl_m = stream.time_ns, stream.first("Alt")
-    separation, horizontal, vertical = (
-        next(
-            (
-                between(receiver.fixes.time_ns, values, time_ns, beyond=True)
-                for receiver in seen
-                if np.isfinite(values := getattr(receiver, name)).any()
-            ),
-            nothing(len(time_ns)),
-        )
-        for name in ("separation_m", "sigma_horizontal_m", "sigma_vertical_m")
-    )
     return Positions(
         stream=stream.stream,
         time_ns=time_ns,
         latitude_deg=stream.columns["Lat"],
         longitude_deg=stream.columns["Lng"],
-        ellipsoidal_m=amsl_m + separation,
+        ellipsoidal_m=amsl_m + borrowed(fixes, separation_m, time_ns),
         amsl_m=amsl_m,
         above_home_m=stream.first("RelHomeAlt", "RelAlt"),
         barometric_m=_barometric(barometer, time_ns),
-        sigma_horizontal_m=horizontal,
-        sigma_vertical_m=vertical,
+        sigma_horizontal_m=borrowed(fixes, lambda fix: fix.sigma_horizontal_m, time_ns),
+        sigma_vertical_m=borrowed(fixes, lambda fix: fix.sigma_vertical_m, time_ns),
         segment=_segments(stream, np.zeros(len(time_ns), np.int64)),
         fused=fused,
     )
@@ -123,7 +116,7 @@ def _fixes(receiver: Receiver, barometer: Samples | None) -> Positions:
 def _barometric(barometer: Samples | None, time_ns: Nanoseconds) -> Floats:
     if barometer is None:
         return nothing(len(time_ns))
-    return between(barometer.time_ns, barometer.columns["Alt"], time_ns, beyond=False)
+    return interpolated(barometer.time_ns, barometer.columns["Alt"], time_ns, ends_hold=False)
 
 
 def _segments(stream: Samples, outage: Ints) -> Ints:
@@ -143,12 +136,7 @@ def _segments(stream: Samples, outage: Ints) -> Ints:
 def _turned(
     stream: Samples, yaw: str, of: Literal["vehicle", "gimbal"], frame: Literal["ned", "heading", "body"]
 ) -> Attitudes:
-    angles = [np.radians(stream.columns[name]) for name in (yaw, "Pitch", "Roll")]
-    n = len(stream.time_ns)
-    q_wxyz = np.empty((n, 4))
-    for begin in range(0, n, _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        q_wxyz[part] = quaternion_from_rotation(ned_from_frd(*(angle[part] for angle in angles)))
+    q_wxyz = ned_quaternions(*(np.radians(stream.columns[name]) for name in (yaw, "Pitch", "Roll")))
     return Attitudes(stream.stream, stream.time_ns, q_wxyz, of, frame, segments(stream.time_ns))
 
 
@@ -178,7 +166,7 @@ def _events(found: Found, shots: dict[str, list[Samples]]) -> tuple[Events, ...]
         for stream in streams:
             logged = stream.first("Img")
             number = np.where(np.isfinite(logged), logged, -1.0).astype(np.int64)
-            sigma_s = _sigma_s(stream) if feedback else _COMMAND_SIGMA_S
+            sigma_s = _sigma_s(stream) if feedback else TRIGGER_SIGMA_S
             out.append(Events(stream.stream, stream.time_ns, number, feedback, sigma_s))
     return tuple(out)
 
@@ -193,7 +181,7 @@ def _feedback(found: Found, *, triggered: bool) -> bool:
 
 def _sigma_s(shots: Samples) -> float:
     if "Img" in shots.columns or len(shots.time_ns) < _FEWEST_TICKS:
-        return _FEEDBACK_SIGMA_S
+        return FEEDBACK_SIGMA_S
     phase_ns = (shots.time_ns - shots.time_ns[0] + _TICK_NS // 2) % _TICK_NS - _TICK_NS // 2
     ticking = bool(np.all(np.abs(phase_ns) <= _TICK_TOLERANCE_NS))
-    return _TICK_SIGMA_S if ticking else _FEEDBACK_SIGMA_S
+    return _TICK_SIGMA_S if ticking else FEEDBACK_SIGMA_S

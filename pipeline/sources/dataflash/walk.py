@@ -133,6 +133,7 @@ class _Walker:
                 "the DataFlash log holds no message",
                 where=self._where,
                 found=f"{self._total} bytes without a whole FMT message",
+                expected="an FMT message before the first of each kind",
                 hint="download the log again from the vehicle",
             )
 

@@ -12,14 +12,14 @@ from pipeline.sources.dji_logs.columns import Place, Turn
 from pipeline.sources.dji_logs.streams import attitudes, positions
 from pipeline.sources.dji_logs.table import Table, read_table, recognised
 from pipeline.sources.files import opened
-from pipeline.sources.records import Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase, in_order
+from pipeline.sources.records import Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase
+from pipeline.sources.streams import TRIGGER_SIGMA_S, in_order
 
 # A moment further from what most agree on is damaged, or from before the first fix. Late ones do no harm, since the
 # earliest arrivals count; early ones do.
 _LATE_US = 2e6
 _EARLY_US = 0.3e6
 _LONGEST_S = 1e7
-_SIGMA_AT_LEAST_S = 0.05
 _HEIGHT_NOTE = (
     "heights above sea level are DJI's (take-off elevation plus barometer, or the receiver's); which datum they are "
     "above is not stated"
@@ -86,7 +86,7 @@ def _clock(table: Table, losses: list[str]) -> tuple[Nanoseconds, Ints]:
     time_ns = np.rint(time_s[rows] * 1e9).astype(np.int64)
     ordered = in_order(time_ns)
     if not ordered.all():
-        losses.append(f"{np.count_nonzero(~ordered)} rows run backwards in time")
+        losses.append(f"{np.count_nonzero(~ordered)} of {len(ordered)} rows run backwards in time and were left out")
     return time_ns[ordered], rows[ordered]
 
 
@@ -121,7 +121,7 @@ def _photos(table: Table, time_ns: Nanoseconds, rows: Ints) -> tuple[Events, ...
     if not len(rises):
         return ()
     step_s = float(np.median(np.diff(time_ns))) / 1e9 if len(time_ns) > 1 else 0.0
-    sigma_s = max(step_s / np.sqrt(12.0), _SIGMA_AT_LEAST_S)
+    sigma_s = max(step_s / np.sqrt(12.0), TRIGGER_SIGMA_S)
     return (Events("isPhoto", time_ns[rises], np.full(len(rises), -1, np.int64), feedback=False, sigma_s=sigma_s),)
 
 

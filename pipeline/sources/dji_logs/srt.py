@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,9 @@ from pipeline.geometry.arrays import Floats, Ints
 from pipeline.sources.dji_logs.srt_cues import Cues, read_cues
 from pipeline.sources.dji_logs.streams import attitudes, positions
 from pipeline.sources.files import opened
-from pipeline.sources.records import Attitudes, FlightLog, Nanoseconds, Positions, TimeBase, in_order
+from pipeline.sources.records import Attitudes, FlightLog, Nanoseconds, Positions, TimeBase
+from pipeline.sources.streams import in_order
+from pipeline.sources.time_bases import UNIX_EPOCH
 
 _ARROW = re.compile(rb"\d\d:\d\d:\d\d[,.]\d{1,3}\s*-->")
 # Whole seconds of the date line run up to one second before or behind the cues; a joined clip is off by more.
@@ -96,7 +98,7 @@ def _clock(cues: Cues, losses: list[str]) -> tuple[Nanoseconds, Ints]:
     time_ns = np.rint(start_ms[rows] * 1e6).astype(np.int64)
     ordered = in_order(time_ns)
     if not ordered.all():
-        losses.append(f"{np.count_nonzero(~ordered)} cues run backwards in time")
+        losses.append(f"{np.count_nonzero(~ordered)} of {len(ordered)} cues run backwards in time and were left out")
     return time_ns[ordered], rows[ordered]
 
 
@@ -201,5 +203,5 @@ def _time_base(cues: Cues, time_ns: Nanoseconds, rows: Ints, facts: dict[str, An
 
 
 def _iso(local_us: float) -> str:
-    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=round(local_us))
+    moment = UNIX_EPOCH + timedelta(microseconds=round(local_us))
     return moment.replace(tzinfo=None).isoformat(timespec="milliseconds")

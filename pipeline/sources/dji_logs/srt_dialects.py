@@ -15,6 +15,8 @@ import re
 from datetime import UTC, datetime, timedelta
 from math import isfinite, nan
 
+from pipeline.sources.time_bases import unix_us
+
 # Bounded repeats: a damaged line of one megabyte must not take quadratic time.
 _NUMBER = r"[-+]?\d{1,12}(?:\.\d{1,12})?"
 _PAIR = re.compile(rf"\b([A-Za-z_]\w{{0,30}})\s{{0,3}}:\s{{0,3}}({_NUMBER})")
@@ -26,7 +28,6 @@ _DATE = re.compile(
     r"(?<!\d)(\d{4})[-.](\d{1,2})[-.](\d{1,2})[ T](\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,6})(?:,(\d{3}))?)?"
     r"(?:\s?(UTC|GMT|Z)\b|\s?([-+])(\d\d):?(\d\d)\b)?"
 )
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 # Column of each name, lower case. "longtitude" is DJI's own spelling.
 _PAIRS = {
@@ -137,4 +138,4 @@ def date(text: str) -> tuple[float, bool] | None:
             moment += offset if found[10] == "-" else -offset
     except (ValueError, OverflowError):
         return None
-    return (moment - _EPOCH) / timedelta(microseconds=1), bool(found[9] or found[10])
+    return float(unix_us(moment)), bool(found[9] or found[10])

@@ -8,14 +8,12 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.geometry.rotations import ned_from_frd, quaternion_from_rotation
 from pipeline.sources.dji_logs.held import new_values, sloped, sloped_longitude
 from pipeline.sources.records import Attitudes, Nanoseconds, Positions, nothing
+from pipeline.sources.streams import ned_quaternions
 
 # An angle of more turns is a damaged number.
 _LARGEST_DEG = 720.0
-# Matrices of a whole long flight at once would take ten times the memory of its quaternions.
-_CHUNK = 1 << 16
 
 
 def positions(
@@ -102,11 +100,7 @@ def attitudes(
     if held:
         new = new_values(angles_deg, segment)
         at, angles_deg, segment = at[new], angles_deg[new], segment[new]
-    quaternions = np.empty((len(at), 4))
-    for begin in range(0, len(at), _CHUNK):
-        yaw, pitch, roll = np.radians(angles_deg[begin : begin + _CHUNK]).T
-        quaternions[begin : begin + _CHUNK] = quaternion_from_rotation(ned_from_frd(yaw, pitch, roll))
-    return Attitudes(stream, time_ns[at], quaternions, of, "ned", segment)
+    return Attitudes(stream, time_ns[at], ned_quaternions(*np.radians(angles_deg).T), of, "ned", segment)
 
 
 def runs(at: Ints) -> Ints:

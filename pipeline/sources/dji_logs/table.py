@@ -7,7 +7,7 @@ import math
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from typing import BinaryIO
 
@@ -16,9 +16,9 @@ import numpy as np
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Floats
 from pipeline.sources.dji_logs.columns import Column, Dimension, Header, Layout, header_of, layout_of
+from pipeline.sources.time_bases import unix_us
 
 _LINE_BYTES = 1 << 20
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TRUE = frozenset({"true", "yes"})
 
 
@@ -172,10 +172,10 @@ def _moment_us(text: str) -> tuple[float, bool] | None:
     try:
         moment = datetime.fromisoformat(text)
         stated = moment.tzinfo is not None
-        since = (moment if stated else moment.replace(tzinfo=UTC)) - _EPOCH
+        since_us = unix_us(moment if stated else moment.replace(tzinfo=UTC))
     except (ValueError, OverflowError):
         return None
-    return since / timedelta(microseconds=1), stated
+    return float(since_us), stated
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:

@@ -11,19 +11,15 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints, Singles
-from pipeline.geometry.rotations import ned_from_frd, quaternion_from_rotation
 from pipeline.sources.mavlink.clock import orderly
 from pipeline.sources.mavlink.frames import Rows
-from pipeline.sources.records import Attitudes, Nanoseconds, segments
+from pipeline.sources.mavlink.gimbal_flags import yaw_frames
+from pipeline.sources.records import NS_PER_MS, Attitudes, Nanoseconds
+from pipeline.sources.streams import is_rotation, ned_quaternions, segments, unit
 
 Frame = Literal["ned", "heading", "body"]
 Quaternions = Floats | Singles
 
-# GIMBAL_DEVICE_FLAGS.
-_YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
-# A unit quaternion in single precision is nearer to 1 than this; another is none.
-_NORM_TOLERANCE = 0.01
-_BATCH = 1 << 16
 # A mount whose angles undo the vehicle's tilt tells them in the body's axes: change of one against change of the other
 # near -1, seen over enough of it.
 _MIRROR_SAMPLES, _MIRROR_SLOPE, _MIRROR_CORRELATION = 50, (-1.5, -0.5), -0.7
@@ -45,7 +41,7 @@ def vehicle_attitudes(angles: Rows | None, quaternions: Rows | None) -> Attitude
         return _stream("ATTITUDE_QUATERNION", quaternions["at"], _boot_ns(quaternions), q, "vehicle", "ned")
     if angles is None:
         return None
-    q = _from_angles(angles["yaw"], angles["pitch"], angles["roll"])
+    q = ned_quaternions(angles["yaw"], angles["pitch"], angles["roll"])
     return _stream("ATTITUDE", angles["at"], _boot_ns(angles), q, "vehicle", "ned")
 
 
@@ -60,13 +56,9 @@ def gimbal_device(rows: Rows, time_ns: Nanoseconds, label: str) -> tuple[list[At
     Returns:
         One stream per frame, and how many messages name both frames, which is not allowed.
     """
-    flags = rows["flags"].astype(np.int64)
-    in_vehicle, in_earth = (flags & _YAW_IN_VEHICLE) > 0, (flags & _YAW_IN_EARTH) > 0
-    # Older devices set neither: then the lock decides.
-    ned = np.where(in_vehicle | in_earth, in_earth, (flags & _YAW_LOCK) > 0)
-    both = in_vehicle & in_earth
-    streams = _by_frame(label, rows["at"], time_ns, rows["q"], (ned & ~both, ~ned & ~both))
-    return list(streams), int(np.count_nonzero(both))
+    ned, heading = yaw_frames(rows["flags"])
+    streams = _by_frame(label, rows["at"], time_ns, rows["q"], (ned, heading))
+    return list(streams), int(np.count_nonzero(~ned & ~heading))
 
 
 def mount_orientation(rows: Rows, time_ns: Nanoseconds, label: str) -> list[Attitudes]:
@@ -84,7 +76,7 @@ def mount_orientation(rows: Rows, time_ns: Nanoseconds, label: str) -> list[Atti
     # A sender that ever tells the absolute yaw means 0 when it is 0; one that never does has no such field.
     told = np.isfinite(absolute) & bool(np.any(np.isfinite(absolute) & (absolute != 0.0)))
     yaw = np.where(told, absolute, rows["yaw"].astype(np.float64))
-    q = _from_angles(*(np.radians(v) for v in (yaw, rows["pitch"], rows["roll"])))
+    q = ned_quaternions(*(np.radians(v) for v in (yaw, rows["pitch"], rows["roll"])))
     return list(_by_frame(label, rows["at"], time_ns, q, (told, ~told)))
 
 
@@ -105,7 +97,7 @@ def mount_status(rows: Rows, time_ns: Nanoseconds, label: str, vehicle: Attitude
     """
     pitch, roll, yaw = (np.radians(rows[f"pointing_{axis}"] / 100.0) for axis in "abc")
     frame: Frame = "body" if vehicle is not None and _mirrors(time_ns, pitch, roll, vehicle) else "heading"
-    stream = _stream(label, rows["at"], time_ns, _from_angles(yaw, pitch, roll), "gimbal", frame)
+    stream = _stream(label, rows["at"], time_ns, ned_quaternions(yaw, pitch, roll), "gimbal", frame)
     return [] if stream is None else [stream]
 
 
@@ -153,27 +145,15 @@ def _stream(
     runs: Ints | None = None,
 ) -> Attitudes | None:
     # NaN is how a gimbal says that it does not know.
-    unit = np.abs(np.linalg.norm(q_wxyz, axis=1) - 1.0) <= _NORM_TOLERANCE
-    good = np.flatnonzero(unit if here is None else unit & here)
+    told = is_rotation(q_wxyz)
+    good = np.flatnonzero(told if here is None else told & here)
     good = good[orderly(at[good], time_ns[good])]
     if not len(good):
         return None
-    q = q_wxyz[good].astype(np.float64)
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
     segment = segments(time_ns[good], None if runs is None else runs[good])
-    return Attitudes(label, time_ns[good], q, of, frame, segment)
-
-
-def _from_angles(yaw_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
-    """Quaternions of yaw, pitch and roll, (n, 4); NaN where an angle is none."""
-    q_wxyz = np.empty((len(yaw_rad), 4))
-    for i in range(0, len(yaw_rad), _BATCH):
-        angles = np.stack([angle[i : i + _BATCH] for angle in (yaw_rad, pitch_rad, roll_rad)]).astype(np.float64)
-        angles[~np.isfinite(angles)] = np.nan
-        q_wxyz[i : i + _BATCH] = quaternion_from_rotation(ned_from_frd(*angles))
-    return q_wxyz
+    return Attitudes(label, time_ns[good], unit(q_wxyz[good]), of, frame, segment)
 
 
 def _boot_ns(rows: Rows) -> Nanoseconds:
-    out: Nanoseconds = rows["time_boot_ms"].astype(np.int64) * 1_000_000
+    out: Nanoseconds = rows["time_boot_ms"].astype(np.int64) * NS_PER_MS
     return out

@@ -10,15 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Ints
-from pipeline.sources.mavlink.clock import HOUR_NS, NS_PER_MS, NS_PER_US, UNIX_FROM_US, BootClock, log_from_utc
+from pipeline.sources.mavlink.clock import HOUR_NS, UNIX_FROM_US, BootClock, log_from_utc
 from pipeline.sources.mavlink.frames import LATEST_STAMP_US, Rows
-from pipeline.sources.records import Events, Nanoseconds, TimeBase
+from pipeline.sources.records import NS_PER_MS, NS_PER_US, Events, Nanoseconds, TimeBase
+from pipeline.sources.streams import FEEDBACK_SIGMA_S, TRIGGER_SIGMA_S
 
 # CAMERA_FEEDBACK_FLAGS: a frame of a video is no photo, and an open loop only asked for one.
 _VIDEO, _OPEN_LOOP = 1, 4
-_FEEDBACK_SIGMA_S = 0.001
-# A trigger was commanded; the shutter follows by a lag that nobody told.
-_TRIGGER_SIGMA_S = 0.05
 # Dates of a clock that is tied to the autopilot's by arrivals alone are off by the link's delay.
 _ARRIVAL_SIGMA_S = 0.2
 
@@ -52,7 +50,7 @@ def camera_feedback(rows: Rows, label: str, clock: BootClock, base: TimeBase) ->
     time_ns, known = _times(photos, clock, base)
     numbers, asked = photos["img_idx"].astype(np.int64), photos["flags"] == _OPEN_LOOP
     least_s = _least_sigma_s(photos, base)
-    sigma_s, asked_sigma_s = max(_FEEDBACK_SIGMA_S, least_s), max(_TRIGGER_SIGMA_S, least_s)
+    sigma_s, asked_sigma_s = max(FEEDBACK_SIGMA_S, least_s), max(TRIGGER_SIGMA_S, least_s)
     found = (
         _events(label, time_ns, numbers, known & ~asked, feedback=True, sigma_s=sigma_s),
         _events(f"{label} (open loop)", time_ns, numbers, known & asked, feedback=False, sigma_s=asked_sigma_s),
@@ -64,7 +62,7 @@ def camera_trigger(rows: Rows, label: str, clock: BootClock, base: TimeBase) -> 
     """Triggers by CAMERA_TRIGGER, arguments and result as of `camera_feedback`."""
     time_ns, known = _times(rows, clock, base)
     numbers = rows["seq"].astype(np.int64)
-    sigma_s = max(_TRIGGER_SIGMA_S, _least_sigma_s(rows, base))
+    sigma_s = max(TRIGGER_SIGMA_S, _least_sigma_s(rows, base))
     events = _events(label, time_ns, numbers, known, feedback=False, sigma_s=sigma_s)
     return Placed(() if events is None else (events,), _unplaced(label, known))
 
@@ -85,7 +83,7 @@ def image_captured(rows: Rows, label: str, clock: BootClock, shift_ns: int = 0) 
     time_ns = taken["time_boot_ms"].astype(np.int64) * NS_PER_MS + shift_ns
     known = np.abs(time_ns - clock.of_arrival(taken)) <= HOUR_NS
     # A clock that was only fitted by arrivals is no better than those.
-    sigma_s = _TRIGGER_SIGMA_S if shift_ns else _FEEDBACK_SIGMA_S
+    sigma_s = TRIGGER_SIGMA_S if shift_ns else FEEDBACK_SIGMA_S
     numbers = taken["image_index"].astype(np.int64)
     images = [bytes(url).split(b"\0", 1)[0].decode("utf-8", "replace") for url in taken["file_url"]]
     events = _events(label, time_ns, numbers, known, feedback=True, sigma_s=sigma_s, images=images)

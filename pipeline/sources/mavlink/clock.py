@@ -12,11 +12,12 @@ import numpy as np
 
 from pipeline.geometry.arrays import Ints
 from pipeline.sources.mavlink.frames import LATEST_STAMP_US, Rows
-from pipeline.sources.records import Nanoseconds, TimeBase, in_order
+from pipeline.sources.records import NS_PER_MS, NS_PER_US, Nanoseconds, TimeBase
+from pipeline.sources.streams import FIX_3D, in_order
+from pipeline.sources.time_bases import UTC_FROM_NS, boot_time_base
 
-# A number of microseconds this large is a date (2001 and later), a smaller one counts from boot.
-UNIX_FROM_US = 1_000_000_000_000_000
-NS_PER_MS, NS_PER_US = 1_000_000, 1_000
+# A number of microseconds this large is a date, a smaller one counts from boot.
+UNIX_FROM_US = UTC_FROM_NS // NS_PER_US
 HOUR_NS = 3_600_000_000_000
 # A clock that falls back this far has restarted; packets overtake one another by less.
 _LEAP_MS = 5_000
@@ -27,8 +28,6 @@ _SUSTAINED = 5
 # Neighbours on each side that a message without a time of its own is placed by.
 _NEIGHBOURS = 8
 _BATCH = 1 << 16
-# Anchors further from the median offset are from before the clock was set.
-_UNSET_NS = 2_000_000_000
 # SYSTEM_TIME messages on each side of an instant that is brought from UTC to the log's clock.
 _ANCHORS = 30
 # Arrival stamps further from the median are damaged: nothing checks them.
@@ -170,23 +169,17 @@ def time_base(clock: BootClock, system_time: Rows | None, gps: Rows | None) -> T
         rows = system_time[dated & (system_time["time_unix_usec"] < LATEST_STAMP_US)]
         if len(rows):
             log_ns = rows["time_boot_ms"].astype(np.int64) * NS_PER_MS
-            return _agreeing(log_ns, rows["time_unix_usec"].astype(np.int64) * NS_PER_US, "SYSTEM_TIME", late=False)
+            return boot_time_base(
+                log_ns, rows["time_unix_usec"].astype(np.int64) * NS_PER_US, "SYSTEM_TIME", late=False
+            )
     if gps is not None:
-        rows = gps[(gps["time_usec"] >= UNIX_FROM_US) & (gps["time_usec"] < LATEST_STAMP_US) & (gps["fix_type"] >= 3)]
+        rows = gps[
+            (gps["time_usec"] >= UNIX_FROM_US) & (gps["time_usec"] < LATEST_STAMP_US) & (gps["fix_type"] >= FIX_3D)
+        ]
         if len(rows):
             utc_ns = rows["time_usec"].astype(np.int64) * NS_PER_US
-            return _agreeing(clock.of_arrival(rows), utc_ns, "GPS_RAW_INT", late=True)
+            return boot_time_base(clock.of_arrival(rows), utc_ns, "GPS_RAW_INT", late=True)
     return _by_arrival(clock)
-
-
-def _agreeing(log_ns: Nanoseconds, utc_ns: Nanoseconds, source: str, *, late: bool) -> TimeBase:
-    """Anchors without those from before the autopilot's clock was set."""
-    offset_ns = utc_ns - log_ns
-    good = np.abs(offset_ns - int(np.median(offset_ns))) <= _UNSET_NS
-    order = np.argsort(log_ns[good], kind="stable")
-    odd = len(good) - int(np.count_nonzero(good))
-    problem = f"{odd} of {len(good)} {source} messages name another time and were left out" if odd else ""
-    return TimeBase("boot", log_ns[good][order], utc_ns[good][order], late, source, problem)
 
 
 def _by_arrival(clock: BootClock) -> TimeBase:

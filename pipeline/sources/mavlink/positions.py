@@ -9,21 +9,17 @@ import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.sources.mavlink.clock import (
-    NS_PER_MS,
-    NS_PER_US,
     UNIX_FROM_US,
     BootClock,
     log_from_utc,
     orderly,
 )
 from pipeline.sources.mavlink.frames import LATEST_STAMP_US, Rows
-from pipeline.sources.records import Nanoseconds, Positions, TimeBase, nothing, segments
+from pipeline.sources.records import NS_PER_MS, NS_PER_S, NS_PER_US, Nanoseconds, Positions, TimeBase, nothing
+from pipeline.sources.streams import FIX_3D, MM_PER_M, PER_DEG, borrowed, is_place, segments, separation_m
 
-_FIX_3D = 3
 # A receiver's time this far from its message's arrival is of another clock.
 _OTHER_CLOCK_NS = 5_000_000_000
-# Geoids lie within 110 m of the ellipsoid.
-_WIDEST_SEPARATION_M = 120.0
 # No aircraft climbs like this: ArduPilot tells heights above its start until it knows the place, then above the sea.
 _LEAP_M, _LEAP_M_S = 5.0, 50.0
 
@@ -42,7 +38,7 @@ def receiver_positions(
     Returns:
         The stream, None without a fix; and what was left out.
     """
-    fixed = (rows["fix_type"] >= _FIX_3D) & _somewhere(rows)
+    fixed = (rows["fix_type"] >= FIX_3D) & _somewhere(rows)
     lost = len(rows) - int(np.count_nonzero(fixed))
     if lost == len(rows):
         return None, (f"no GPS fix: none of {lost} {name} messages has one",)
@@ -55,10 +51,10 @@ def receiver_positions(
     stream = Positions(
         name,
         time_ns,
-        rows["lat"][index] / 1e7,
-        rows["lon"][index] / 1e7,
+        rows["lat"][index] / PER_DEG,
+        rows["lon"][index] / PER_DEG,
         _known(rows["alt_ellipsoid"][index]),
-        rows["alt"][index] / 1000.0,
+        rows["alt"][index] / MM_PER_M,
         nothing(len(index)),
         nothing(len(index)),
         _known(rows["h_acc"][index]),
@@ -86,18 +82,18 @@ def fused_positions(rows: Rows, receivers: tuple[Positions, ...]) -> tuple[Posit
     losses = (f"{lost} GLOBAL_POSITION_INT messages without a position (0, 0) were left out",) if lost else ()
     if not len(index):
         return None, losses
-    time_ns, amsl_m = time_ns[index], rows["alt"][index] / 1000.0
+    time_ns, amsl_m = time_ns[index], rows["alt"][index] / MM_PER_M
     stream = Positions(
         "GLOBAL_POSITION_INT",
         time_ns,
-        rows["lat"][index] / 1e7,
-        rows["lon"][index] / 1e7,
-        amsl_m + _separation_m(time_ns, receivers),
+        rows["lat"][index] / PER_DEG,
+        rows["lon"][index] / PER_DEG,
+        amsl_m + borrowed(receivers, separation_m, time_ns),
         amsl_m,
-        rows["relative_alt"][index] / 1000.0,
+        rows["relative_alt"][index] / MM_PER_M,
         nothing(len(index)),
-        _between(time_ns, receivers, "sigma_horizontal_m"),
-        _between(time_ns, receivers, "sigma_vertical_m"),
+        borrowed(receivers, lambda receiver: receiver.sigma_horizontal_m, time_ns),
+        borrowed(receivers, lambda receiver: receiver.sigma_vertical_m, time_ns),
         segments(time_ns, _leaps(time_ns, amsl_m)),
         fused=True,
     )
@@ -106,16 +102,14 @@ def fused_positions(rows: Rows, receivers: tuple[Positions, ...]) -> tuple[Posit
 
 def _leaps(time_ns: Nanoseconds, height_m: Floats) -> Ints:
     """How often the height has leapt so far, (n,)."""
-    most_m = _LEAP_M + _LEAP_M_S * np.diff(time_ns, prepend=time_ns[0]) / 1e9
+    most_m = _LEAP_M + _LEAP_M_S * np.diff(time_ns, prepend=time_ns[0]) / NS_PER_S
     leapt = np.abs(np.diff(height_m, prepend=height_m[0])) > most_m
     return np.cumsum(leapt, dtype=np.int64)
 
 
 def _somewhere(rows: Rows) -> Bools:
     """Rows whose position is one: not the (0, 0) of an autopilot that does not know, and on the globe."""
-    lat, lon = rows["lat"].astype(np.int64), rows["lon"].astype(np.int64)
-    out: Bools = ((lat != 0) | (lon != 0)) & (np.abs(lat) <= 900_000_000) & (np.abs(lon) <= 1_800_000_000)
-    return out
+    return is_place(rows["lat"] / PER_DEG, rows["lon"] / PER_DEG)
 
 
 def _receiver_time(rows: Rows, clock: BootClock, base: TimeBase) -> Nanoseconds:
@@ -133,25 +127,5 @@ def _receiver_time(rows: Rows, clock: BootClock, base: TimeBase) -> Nanoseconds:
 
 def _known(millimetres: np.ndarray) -> Floats:
     """Metres; NaN for 0, by which MAVLink says that it does not know."""
-    out: Floats = np.where(millimetres == 0, np.nan, millimetres / 1000.0)
+    out: Floats = np.where(millimetres == 0, np.nan, millimetres / MM_PER_M)
     return out
-
-
-def _separation_m(time_ns: Nanoseconds, receivers: tuple[Positions, ...]) -> Floats:
-    """Height of the geoid above the ellipsoid as the first receiver that knows it says, (n,); NaN where none does."""
-    for receiver in receivers:
-        above_m = receiver.ellipsoidal_m - receiver.amsl_m
-        known = np.abs(above_m) <= _WIDEST_SEPARATION_M
-        if known.any():
-            return np.interp(time_ns, receiver.time_ns[known], above_m[known])
-    return nothing(len(time_ns))
-
-
-def _between(time_ns: Nanoseconds, receivers: tuple[Positions, ...], name: str) -> Floats:
-    """A receiver's sigma at other instants, (n,); NaN where none tells it."""
-    for receiver in receivers:
-        sigma_m: Floats = getattr(receiver, name)
-        known = np.isfinite(sigma_m)
-        if known.any():
-            return np.interp(time_ns, receiver.time_ns[known], sigma_m[known])
-    return nothing(len(time_ns))

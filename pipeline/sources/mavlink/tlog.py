@@ -14,11 +14,10 @@ from pipeline.engine.errors import InputError
 from pipeline.sources.files import opened
 from pipeline.sources.mavlink.attitudes import gimbal_device, mount_orientation, mount_status, vehicle_attitudes
 from pipeline.sources.mavlink.camera import Placed, camera_feedback, camera_trigger, image_captured
-from pipeline.sources.mavlink.clock import NS_PER_MS
 from pipeline.sources.mavlink.frames import LATEST_STAMP_US, STAMP_BYTES, Rows, Telemetry, read_frames
 from pipeline.sources.mavlink.positions import fused_positions, receiver_positions
 from pipeline.sources.mavlink.vehicle import Vehicle, find_vehicle
-from pipeline.sources.records import Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase
+from pipeline.sources.records import NS_PER_MS, NS_PER_S, Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase
 
 _KIND = "MAVLink telemetry"
 _RECEIVER = ("time_usec", "fix_type", "lat", "lon", "alt", "alt_ellipsoid", "h_acc", "v_acc")
@@ -145,7 +144,7 @@ class _Gathered:
             if streams:
                 undone = streams[0].frame == "body"
                 seen = "its angles undo the vehicle's tilt" if undone else "the message does not say"
-                self.facts[f"{label} frame"] = f"{streams[0].frame}: {seen}"
+                self.facts.setdefault("gimbal_frames", {})[label] = f"{streams[0].frame}: {seen}"
 
     def add_events(self, vehicle: Vehicle) -> None:
         """Exposures and triggers."""
@@ -169,7 +168,8 @@ class _Gathered:
     def _shift_ns(self, vehicle: Vehicle, label: str, rows: Rows, *, own: bool) -> int:
         shift_ns = 0 if own else vehicle.clock_shift_ns(rows)
         if shift_ns:
-            self.facts[f"{label} clock"] = f"its own, {shift_ns / 1e9:.2f} s behind the autopilot's by arrivals"
+            told = f"its own, {shift_ns / NS_PER_S:.2f} s behind the autopilot's by arrivals"
+            self.facts.setdefault("component_clocks", {})[label] = told
         return shift_ns
 
 
@@ -177,13 +177,13 @@ def _facts(telemetry: Telemetry, vehicle: Vehicle) -> dict[str, Any]:
     from pymavlink.dialects.v20.ardupilotmega import enums  # noqa: PLC0415 - heavy
 
     facts: dict[str, Any] = {
-        "system": vehicle.sender[0],
-        "component": vehicle.sender[1],
+        "system_id": vehicle.sender[0],
+        "component_id": vehicle.sender[1],
         "mavlink_versions": telemetry.versions,
     }
     for key, enum, number in (
         ("autopilot", "MAV_AUTOPILOT", vehicle.autopilot),
-        ("vehicle", "MAV_TYPE", vehicle.kind),
+        ("vehicle_type", "MAV_TYPE", vehicle.kind),
     ):
         if number >= 0:
             facts[key] = enums[enum][number].name if number in enums[enum] else f"{enum} {number}"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.sources.mavlink.clock import NS_PER_MS, BootClock, boot_clock, restarts, time_base
+from pipeline.sources.mavlink.clock import BootClock, boot_clock, restarts, time_base
 from pipeline.sources.mavlink.frames import Rows, Sender, Telemetry
-from pipeline.sources.records import TimeBase
+from pipeline.sources.records import NS_PER_MS, TimeBase
 
 _POSITION = "GLOBAL_POSITION_INT"
 # The autopilot's messages that tell its time since boot.

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from pipeline.engine.errors import InputError
+from pipeline.sources.px4.topics import labelled
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER_BYTES = 16
@@ -224,15 +225,15 @@ class _Walk:
         if len(message) < 7 or _TOPIC.fullmatch(message, 6) is None:
             return False
         topic, instance, number = message[6:].decode(), message[3], message[4:6]
-        label = f"{topic}[{instance}]" if instance else topic
+        label = labelled(topic, instance)
         try:
             fields = _leaves(self.formats, topic)
         except ValueError as error:
-            self.found.losses.append(f"{label}: its records are lost, {error}.")
+            self.found.losses.append(f"all {label} records are lost: {error}")
             return True
         wanted = topic in self.topics
         if wanted and ("timestamp", "uint64_t") not in fields:
-            self.found.losses.append(f"{label}: its records have no time and were left out.")
+            self.found.losses.append(f"all {label} records were left out: they have no time")
             wanted = False
         most = sum(_SIZES[kind] for _, kind in fields)
         # Padding at the end need not be logged.
@@ -260,12 +261,12 @@ class _Walk:
             if subscription.records:
                 found.counts[subscription.label] = found.counts.get(subscription.label, 0) + subscription.records
         if self.damage["places"]:
-            found.losses.append(f"{self.damage['bytes']} bytes in {self.damage['places']} places are damaged.")
+            found.losses.append(f"{self.damage['bytes']} bytes in {self.damage['places']} damaged places were skipped")
         if self.damage["tail"]:
-            found.losses.append(f"The log breaks off: its last {self.damage['tail']} bytes are no whole message.")
+            found.losses.append(f"the last message is cut short: {self.damage['tail']} bytes")
         if found.dropout_ms:
             lost_s = sum(found.dropout_ms) / 1e3
-            found.losses.append(f"The logger itself lost data {len(found.dropout_ms)} times, {lost_s:.3f} s in all.")
+            found.losses.append(f"the logger itself lost data {len(found.dropout_ms)} times, {lost_s:.3f} s in all")
 
 
 def _leaves(formats: dict[str, list[tuple[str, int, str]]], topic: str, depth: int = 0) -> list[tuple[str, str]]:

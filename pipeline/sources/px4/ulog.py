@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from pipeline.engine.errors import InputError
-from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
+from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.sources.files import local_copy
+from pipeline.sources.mavlink.gimbal_flags import yaw_frames
 from pipeline.sources.px4.sieve import MAGIC, sift
-from pipeline.sources.records import (
-    Attitudes,
-    Events,
-    FlightLog,
-    Nanoseconds,
-    Positions,
-    TimeBase,
-    in_order,
-    nothing,
+from pipeline.sources.px4.topics import Topic, labelled, named
+from pipeline.sources.records import NS_PER_US, Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase, nothing
+from pipeline.sources.streams import (
+    FEEDBACK_SIGMA_S,
+    FIX_3D,
+    MM_PER_M,
+    PER_DEG,
+    TRIGGER_SIGMA_S,
+    borrowed,
+    interpolated,
+    is_place,
+    is_rotation,
     segments,
+    separation_m,
+    unit,
 )
+from pipeline.sources.time_bases import boot_time_base
 
 _FUSED = "vehicle_global_position"
 _RECEIVERS = ("sensor_gps", "vehicle_gps_position")
@@ -31,19 +37,12 @@ _VEHICLE, _GIMBAL = "vehicle_attitude", "gimbal_device_attitude_status"
 _CAPTURE, _TRIGGER = "camera_capture", "camera_trigger"
 _HOME, _AIR = "home_position", "vehicle_air_data"
 _TOPICS = frozenset({_FUSED, *_RECEIVERS, _VEHICLE, _GIMBAL, _CAPTURE, _TRIGGER, _HOME, _AIR})
-_FACTS = {"sys_name": "system", "ver_hw": "hardware"}
+_FACTS = {"sys_name": "autopilot", "ver_hw": "hardware"}
 _RELEASE, _CAPTURE_FEEDBACK = "ver_sw_release", "CAM_CAP_FBACK"
 # What the library raises on messages it cannot make sense of.
 _REFUSALS = (struct.error, ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError, MemoryError)
-# Microseconds later than this on any clock are damage: the year 2096.
-_LAST_US = 4_000_000_000_000_000
 # UTC before 2010 or after 2100 is no time of a flight.
 _FIRST_UTC_US, _LAST_UTC_US = 1_262_304_000_000_000, 4_102_444_800_000_000
-_FIX_3D = 3
-# GIMBAL_DEVICE_FLAGS of MAVLink.
-_YAW_LOCK, _IN_VEHICLE_FRAME, _IN_EARTH_FRAME = 16, 32, 64
-# The hot shoe's interrupt is stamped at once; from a commanded trigger to the exposure is the camera's own matter.
-_FEEDBACK_SIGMA_S, _TRIGGER_SIGMA_S = 0.001, 0.05
 
 
 def is_format(head: bytes, name: str) -> bool:  # noqa: ARG001 - the readers' common signature
@@ -80,17 +79,17 @@ def read(location: str) -> FlightLog:
             "E-ULOG-02", "the ULog cannot be decoded", where=location, found=f"{type(error).__name__}: {error}",
             expected="messages as their definitions say", hint="copy it from the vehicle again",
         ) from error  # fmt: skip
-    topics = [_Topic(_label(data.name, data.multi_id), data.name, data.data) for data in log.data_list]
+    topics = [Topic(labelled(data.name, data.multi_id), data.name, data.data) for data in log.data_list]
     losses = list(found.losses)
-    receivers = [stream for topic in _named(topics, *_RECEIVERS) if (stream := _positions(topic, losses))]
-    fused = [stream for topic in _named(topics, _FUSED) if (stream := _positions(topic, losses))]
+    receivers = [stream for topic in named(topics, *_RECEIVERS) if (stream := _positions(topic, losses))]
+    fused = [stream for topic in named(topics, _FUSED) if (stream := _positions(topic, losses))]
     heights = _Heights(topics, receivers)
     echoed = log.initial_parameters.get(_CAPTURE_FEEDBACK) == 0
     return FlightLog(
         location=location,
         kind="PX4 ULog",
         counts=found.counts,
-        time_base=_time_base(_named(topics, *_RECEIVERS)),
+        time_base=_time_base(named(topics, *_RECEIVERS)),
         positions=tuple(heights.filled(stream) for stream in (*fused, *receivers)),
         attitudes=tuple(_attitudes(topics, losses)),
         events=tuple(_events(topics, echoed, losses)),
@@ -99,89 +98,27 @@ def read(location: str) -> FlightLog:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Topic:
-    """One instance of a topic.
-
-    Args:
-        label: Name, with the instance where it is not the first.
-        name: Without.
-        columns: Fields by name; elements of arrays as "q[0]".
-    """
-
-    label: str
-    name: str
-    columns: Mapping[str, AnyArray]
-
-    def raw(self, *names: str) -> AnyArray | None:
-        """The first of these fields that the firmware logged."""
-        return next((self.columns[name] for name in names if name in self.columns), None)
-
-    def scaled(self, name: str, whole: str, unit: float) -> Floats:
-        """A field, or the older one in whole units; NaN when neither is there."""
-        values = self.raw(name, whole)
-        if values is None:
-            return nothing(len(self.columns["timestamp"]))
-        scale = unit if np.issubdtype(values.dtype, np.integer) else 1.0
-        # Damage makes signalling NaNs.
-        with np.errstate(invalid="ignore"):
-            return np.asarray(values, np.float64) * scale
-
-    def number(self, name: str) -> Floats:
-        """A field; NaN when it is not there."""
-        return self.scaled(name, name, 1.0)
-
-    def quaternions(self) -> Floats:
-        """(n, 4)."""
-        return np.stack([self.number(f"q[{index}]") for index in range(4)], axis=-1)
-
-    def time_us(self, *, sampled: bool = False) -> Ints:
-        """Times, 0 where they are none; of the measurement where the firmware logged it and it is asked for."""
-        stamps = self.columns["timestamp"]
-        samples = self.raw("timestamp_sample")
-        if sampled and samples is not None and samples.dtype == stamps.dtype:
-            stamps = np.where((samples > 0) & (samples <= stamps), samples, stamps)
-        return np.where(stamps < _LAST_US, stamps, 0).astype(np.int64)
-
-    def kept(self, time_us: Ints, good: Bools, losses: list[str]) -> Ints:
-        """Indices of samples that are good and in order of time; the others are told of."""
-        index = np.flatnonzero(good & (time_us > 0))
-        index = index[in_order(time_us[index])]
-        lost = len(good) - len(index)
-        if lost:
-            losses.append(f"{self.label}: {lost} records with impossible values or times were left out.")
-        return index
-
-
-def _label(name: str, instance: int) -> str:
-    return f"{name}[{instance}]" if instance else name
-
-
-def _named(topics: Iterable[_Topic], *names: str) -> list[_Topic]:
-    return [topic for name in names for topic in topics if topic.name == name]
-
-
-def _positions(topic: _Topic, losses: list[str]) -> Positions | None:
+def _positions(topic: Topic, losses: list[str]) -> Positions | None:
     """The positions of the filter or of a receiver; None when none is good."""
     fused = topic.name == _FUSED
-    latitude = topic.scaled("latitude_deg", "lat", 1e-7)
-    longitude = topic.scaled("longitude_deg", "lon", 1e-7)
+    latitude = topic.scaled("latitude_deg", "lat", PER_DEG)
+    longitude = topic.scaled("longitude_deg", "lon", PER_DEG)
     if np.all(np.isnan(latitude)) or np.all(np.isnan(longitude)):
-        losses.append(f"{topic.label}: it has no latitude and longitude.")
+        losses.append(f"{topic.label} has no latitude and longitude: its {len(topic)} records were left out")
         return None
-    fixed = _flag(topic, "lat_lon_valid") if fused else topic.number("fix_type") >= _FIX_3D
+    fixed = topic.flag("lat_lon_valid") if fused else topic.number("fix_type") >= FIX_3D
     # Without a fix nothing is lost that anybody had: only the others are told of.
-    possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & ((latitude != 0.0) | (longitude != 0.0))
+    possible = is_place(latitude, longitude)
     time_us = topic.time_us(sampled=True)
     index = topic.kept(time_us, possible | ~fixed, losses)
     index = index[(possible & fixed)[index]]
     if not len(index):
         return None
-    amsl = topic.scaled("altitude_msl_m", "alt", 1e-3)
-    ellipsoidal = topic.scaled("altitude_ellipsoid_m", "alt_ellipsoid", 1e-3)
-    heights_good = _flag(topic, "alt_valid")
-    breaks = np.cumsum(~fixed) + _changes(topic, "lat_lon_reset_counter", "alt_reset_counter")
-    time_ns = time_us[index] * 1000
+    amsl = topic.scaled("altitude_msl_m", "alt", MM_PER_M)
+    ellipsoidal = topic.scaled("altitude_ellipsoid_m", "alt_ellipsoid", MM_PER_M)
+    heights_good = topic.flag("alt_valid")
+    breaks = np.cumsum(~fixed) + topic.changes("lat_lon_reset_counter", "alt_reset_counter")
+    time_ns = time_us[index] * NS_PER_US
     return Positions(
         stream=topic.label,
         time_ns=time_ns,
@@ -198,22 +135,6 @@ def _positions(topic: _Topic, losses: list[str]) -> Positions | None:
     )
 
 
-def _flag(topic: _Topic, name: str) -> Bools:
-    """A flag, which older firmware does not log: then all is good."""
-    values = topic.raw(name)
-    return np.ones(len(topic.columns["timestamp"]), np.bool_) if values is None else np.asarray(values != 0)
-
-
-def _changes(topic: _Topic, *counters: str) -> Ints:
-    """How often any of these counters had changed, (n,)."""
-    out = np.zeros(len(topic.columns["timestamp"]), np.int64)
-    for name in counters:
-        values = topic.raw(name)
-        if values is not None:
-            out[1:] += np.cumsum(values[1:] != values[:-1])
-    return out
-
-
 def _finite(values: Floats) -> Floats:
     """Heights, NaN where they are not of this earth."""
     return np.where(np.abs(values) < 1e5, values, np.nan)
@@ -227,64 +148,57 @@ def _sigma(values: Floats) -> Floats:
 class _Heights:
     """Heights that a position's own topic does not hold, from the topics that do."""
 
-    def __init__(self, topics: Sequence[_Topic], receivers: Sequence[Positions]) -> None:
-        self.home = _step(_named(topics, _HOME), "alt", "valid_alt")
-        self.air = _step(_named(topics, _AIR), "baro_alt_meter", "")
-        # By the receiver's own geoid, whichever that is: adding it again undoes what the receiver subtracted.
-        self.separation: tuple[Nanoseconds, Floats] | None = None
-        for stream in receivers:
-            known = np.isfinite(stream.ellipsoidal_m - stream.amsl_m)
-            if self.separation is None and np.any(known):
-                self.separation = stream.time_ns[known], (stream.ellipsoidal_m - stream.amsl_m)[known]
+    def __init__(self, topics: Sequence[Topic], receivers: Sequence[Positions]) -> None:
+        self.home = _step(named(topics, _HOME), "alt", "valid_alt")
+        self.air = _step(named(topics, _AIR), "baro_alt_meter", "")
+        self.receivers = receivers
 
     def filled(self, stream: Positions) -> Positions:
         """A stream with the heights it lacks."""
         time_ns = stream.time_ns
         ellipsoidal, above_home, barometric = stream.ellipsoidal_m, stream.above_home_m, stream.barometric_m
-        if self.separation is not None:
-            # The geoid is level over a flight, so its ends may be held.
-            apart = np.interp(time_ns, *self.separation)
-            ellipsoidal = np.where(np.isnan(ellipsoidal), stream.amsl_m + apart, ellipsoidal)
+        if np.isnan(ellipsoidal).any():
+            by_receiver = stream.amsl_m + borrowed(self.receivers, separation_m, time_ns)
+            ellipsoidal = np.where(np.isnan(ellipsoidal), by_receiver, ellipsoidal)
         if self.home is not None:
             latest = np.searchsorted(self.home[0], time_ns, side="right") - 1
             above_home = stream.amsl_m - self.home[1][np.maximum(latest, 0)]
         if self.air is not None:
-            barometric = np.interp(time_ns, *self.air, left=np.nan, right=np.nan)
+            barometric = interpolated(*self.air, time_ns, ends_hold=False)
         return Positions(
             stream.stream, time_ns, stream.latitude_deg, stream.longitude_deg, ellipsoidal, stream.amsl_m, above_home,
             barometric, stream.sigma_horizontal_m, stream.sigma_vertical_m, stream.segment, stream.fused,
         )  # fmt: skip
 
 
-def _step(topics: Sequence[_Topic], name: str, valid: str) -> tuple[Nanoseconds, Floats] | None:
+def _step(topics: Sequence[Topic], name: str, valid: str) -> tuple[Nanoseconds, Floats] | None:
     """Times and values of a height; None when there is none."""
     if not topics:
         return None
     topic = topics[0]
     values = _finite(topic.number(name))
     # A height that cannot be used costs nothing but itself, and the positions say what they lack.
-    index = topic.kept(topic.time_us(sampled=True), np.isfinite(values) & _flag(topic, valid), [])
-    return (topic.time_us(sampled=True)[index] * 1000, values[index]) if len(index) else None
+    index = topic.kept(topic.time_us(sampled=True), np.isfinite(values) & topic.flag(valid), [])
+    return (topic.time_us(sampled=True)[index] * NS_PER_US, values[index]) if len(index) else None
 
 
-def _attitudes(topics: Sequence[_Topic], losses: list[str]) -> Iterable[Attitudes]:
-    for topic in _named(topics, _VEHICLE):
-        breaks = _changes(topic, "quat_reset_counter")
+def _attitudes(topics: Sequence[Topic], losses: list[str]) -> Iterable[Attitudes]:
+    for topic in named(topics, _VEHICLE):
+        breaks = topic.changes("quat_reset_counter")
         every = np.ones(len(breaks), np.bool_)
         yield from _turned(topic, "vehicle", "ned", every, breaks, losses)
-    for topic in _named(topics, _GIMBAL):
+    for topic in named(topics, _GIMBAL):
         flags = topic.raw("device_flags")
-        # Without an explicit frame the yaw lock tells it (MAVLink, GIMBAL_DEVICE_ATTITUDE_STATUS).
-        whole = np.zeros(len(topic.columns["timestamp"]), np.int64) if flags is None else flags.astype(np.int64)
-        explicit = (whole & (_IN_VEHICLE_FRAME | _IN_EARTH_FRAME)) != 0
-        earth = np.where(explicit, (whole & _IN_EARTH_FRAME) != 0, (whole & _YAW_LOCK) != 0)
-        breaks = np.concatenate([[0], np.cumsum(earth[1:] != earth[:-1])])
-        yield from _turned(topic, "gimbal", "ned", earth, breaks, losses)
-        yield from _turned(topic, "gimbal", "heading", ~earth, breaks, losses)
+        ned, heading = yaw_frames(np.zeros(len(topic), np.int64) if flags is None else flags)
+        if odd := int(np.count_nonzero(~ned & ~heading)):
+            losses.append(f"{odd} {topic.label} records name two frames at once and were left out")
+        breaks = np.cumsum(np.diff(ned, prepend=ned[:1]), dtype=np.int64)
+        yield from _turned(topic, "gimbal", "ned", ned, breaks, losses)
+        yield from _turned(topic, "gimbal", "heading", heading, breaks, losses)
 
 
 def _turned(
-    topic: _Topic,
+    topic: Topic,
     of: Literal["vehicle", "gimbal"],
     frame: Literal["ned", "heading"],
     here: Bools,
@@ -293,17 +207,15 @@ def _turned(
 ) -> Iterable[Attitudes]:
     """A stream of those attitudes that are against one frame, where there are any."""
     q = topic.quaternions()
-    norm = np.linalg.norm(q, axis=-1)
     time_us = topic.time_us(sampled=True)
-    index = topic.kept(time_us[here], (np.abs(norm - 1.0) < 0.05)[here], losses)
+    index = topic.kept(time_us[here], is_rotation(q)[here], losses)
     index = np.flatnonzero(here)[index]
     if len(index):
-        time_ns = time_us[index] * 1000
-        unit = q[index] / norm[index, None]
-        yield Attitudes(topic.label, time_ns, unit, of, frame, segments(time_ns, breaks[index]))
+        time_ns = time_us[index] * NS_PER_US
+        yield Attitudes(topic.label, time_ns, unit(q[index]), of, frame, segments(time_ns, breaks[index]))
 
 
-def _events(topics: Sequence[_Topic], echoed: bool, losses: list[str]) -> Iterable[Events]:
+def _events(topics: Sequence[Topic], echoed: bool, losses: list[str]) -> Iterable[Events]:
     """Camera events.
 
     Args:
@@ -312,34 +224,34 @@ def _events(topics: Sequence[_Topic], echoed: bool, losses: list[str]) -> Iterab
             not asked for (CAM_CAP_FBACK = 0).
         losses: Told what was left out.
     """
-    for topic in _named(topics, _CAPTURE):
-        taken = np.ones(len(topic.columns["timestamp"]), np.bool_)
+    for topic in named(topics, _CAPTURE):
+        taken = np.ones(len(topic), np.bool_)
         results = topic.raw("result")
         if results is not None:
             taken = np.asarray(results == 1)
             if failed := int(np.sum(~taken)):
-                losses.append(f"{topic.label}: {failed} captures that the camera did not confirm were left out.")
+                losses.append(f"{failed} {topic.label} records tell of a capture that failed")
         yield from _exposed(topic, topic.label, taken, not echoed, losses)
-    for topic in _named(topics, _TRIGGER):
+    for topic in named(topics, _TRIGGER):
         reported = topic.raw("feedback")
-        confirmed = np.zeros(len(topic.columns["timestamp"]), np.bool_) if reported is None else reported != 0
+        confirmed = np.zeros(len(topic), np.bool_) if reported is None else reported != 0
         yield from _exposed(topic, f"{topic.label} (feedback)", confirmed, True, losses)
         yield from _exposed(topic, topic.label, ~confirmed, False, losses)
 
 
-def _exposed(topic: _Topic, label: str, here: Bools, feedback: bool, losses: list[str]) -> Iterable[Events]:
+def _exposed(topic: Topic, label: str, here: Bools, feedback: bool, losses: list[str]) -> Iterable[Events]:
     time_us = topic.time_us()
     index = np.flatnonzero(here)[topic.kept(time_us[here], here[here], losses)]
     if len(index):
         numbers = topic.raw("seq")
         number = np.full(len(index), -1, np.int64) if numbers is None else numbers[index].astype(np.int64)
-        sigma_s = _FEEDBACK_SIGMA_S if feedback else _TRIGGER_SIGMA_S
-        yield Events(label, time_us[index] * 1000, number, feedback, sigma_s)
+        sigma_s = FEEDBACK_SIGMA_S if feedback else TRIGGER_SIGMA_S
+        yield Events(label, time_us[index] * NS_PER_US, number, feedback, sigma_s)
 
 
-def _time_base(receivers: Sequence[_Topic]) -> TimeBase:
+def _time_base(receivers: Sequence[Topic]) -> TimeBase:
     """UTC by the receiver that gave it most often."""
-    best = TimeBase("boot", problem="No receiver gave UTC: the log's clock counts from the autopilot's start.")
+    best = TimeBase("boot", problem="boot time only: no receiver gave UTC")
     for topic in receivers:
         utc = topic.raw("time_utc_usec")
         if utc is None or not np.issubdtype(utc.dtype, np.integer):
@@ -350,11 +262,9 @@ def _time_base(receivers: Sequence[_Topic]) -> TimeBase:
         index = topic.kept(time_us, (utc > _FIRST_UTC_US) & (utc < _LAST_UTC_US), [])
         if len(index) <= len(best.anchor_log_ns):
             continue
-        log_ns, utc_ns = time_us[index] * 1000, utc[index].astype(np.int64) * 1000
-        spread_s = float(np.ptp(utc_ns - log_ns)) / 1e9
-        problem = f"{topic.label}: UTC against the log's clock jumps by {spread_s:.1f} s." if spread_s > 1.0 else ""
+        log_ns, utc_ns = time_us[index] * NS_PER_US, utc[index].astype(np.int64) * NS_PER_US
         # Both stamps are of the arrival at the autopilot: real logs scatter by tens of milliseconds.
-        best = TimeBase("boot", log_ns, utc_ns, True, f"{topic.label}.time_utc_usec", problem)
+        best = boot_time_base(log_ns, utc_ns, f"{topic.label}.time_utc_usec", late=True)
     return best
 
 

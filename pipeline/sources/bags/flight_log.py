@@ -1,22 +1,23 @@
-"""From a bag's columns to the records of a flight, all on one clock."""
+"""A bag's columns as the records of a flight, all on one clock."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
-from pipeline.sources.bags.columns import Samples, Timed, epoch_of, timed
+from pipeline.sources.bags.columns import Columns, Timed, epoch_of, timed
+from pipeline.sources.bags.container import Bag
 from pipeline.sources.bags.frame_tree import transform_between
 from pipeline.sources.bags.messages import BagMessages, Calibration, Edge
 from pipeline.sources.records import (
     Attitudes,
     Events,
     FixedTransform,
+    FlightLog,
     ImageStream,
     LocalPoses,
     LoggedCamera,
@@ -24,11 +25,11 @@ from pipeline.sources.records import (
     SweepStream,
     TimeBase,
     nothing,
-    segments,
 )
+from pipeline.sources.streams import FEEDBACK_SIGMA_S, is_rotation, segments, unit
 
-# A camera that reports an exposure by its calibration message stamps it as it would its image.
-_REPORTED_SIGMA_S, _TRIGGERED_SIGMA_S = 0.001, 0.01
+# A trigger line's own time reference, not the command that passed through an autopilot.
+_TRIGGER_LINE_SIGMA_S = 0.01
 # Half turns, w first: about east + north, and about forward.
 _NED_FROM_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 _FLU_FROM_FRD = np.array([0.0, 1.0, 0.0, 0.0])
@@ -36,35 +37,25 @@ _FLU_FROM_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 _BODY = "base_link"
 
 
-@dataclass(frozen=True, slots=True)
-class BagContent:
-    """The records of a bag; fields as in `FlightLog`. Among the facts are the frames that the attitudes are of."""
-
-    time_base: TimeBase
-    positions: tuple[Positions, ...]
-    attitudes: tuple[Attitudes, ...]
-    events: tuple[Events, ...]
-    poses: tuple[LocalPoses, ...]
-    transforms: tuple[FixedTransform, ...]
-    images: tuple[ImageStream, ...]
-    cameras: tuple[LoggedCamera, ...]
-    sweeps: tuple[SweepStream, ...]
-    losses: tuple[str, ...]
-    facts: Mapping[str, Any]
-
-
-def records_of(messages: BagMessages) -> BagContent:
+def flight_log(messages: BagMessages, bag: Bag, location: str, losses: Iterable[str]) -> FlightLog:
     """Makes the records of all messages of a bag.
 
     Args:
         messages: All that were read.
+        bag: The container, read to its end.
+        location: Path or URL.
+        losses: What could not be decoded, one sentence each.
 
     Returns:
-        The records.
+        The log; `facts["attitude_frames"]` says which frames the attitudes are of.
 
     Source: ROS REP 103 (axes), REP 145 (Imu: orientation is ENU_from_FLU), sensor_msgs; Foxglove schemas.
     """
-    return _Maker(messages).content()
+    found = _Maker(messages).log(location, bag.kind)
+    facts = {**bag.facts, "duration_s": bag.duration_s, "topics": dict(sorted(bag.types.items())), **found.facts}
+    return replace(
+        found, counts=dict(sorted(bag.counted.items())), losses=(*bag.losses, *losses, *found.losses), facts=facts
+    )
 
 
 class _Maker:
@@ -76,13 +67,16 @@ class _Maker:
         self._attitude_frames: dict[str, str] = {}
         self._epoch = epoch_of(messages.streams())
 
-    def content(self) -> BagContent:
+    def log(self, location: str, kind: str) -> FlightLog:
         positions = tuple(self._positions(topic, samples) for topic, samples in self._of.fixes.items())
         poses = [self._poses(key, samples, key[0]) for key, samples in self._of.poses.items()]
         edges = [self._poses(key, rows, f"{key[0]} {key[1]}>{key[2]}") for key, rows in self._of.edges.items()]
         transforms = self._transforms()
         attitudes, cameras, events = self._attitudes(transforms), self._cameras(), self._events()
-        return BagContent(
+        return FlightLog(
+            location=location,
+            kind=kind,
+            counts={},
             time_base=self._time_base(),
             positions=tuple(stream for stream in positions if len(stream.time_ns)),
             attitudes=attitudes,
@@ -100,18 +94,20 @@ class _Maker:
         problem = "" if self._epoch == "utc" else "stamps do not count from 1970: simulated time, or a clock never set"
         return TimeBase(self._epoch, source="header stamps, by the clock of the machine that stamped", problem=problem)
 
-    def _in_time(self, stream: str, samples: Samples, good: np.ndarray | None = None, *, tell: bool = True) -> Timed:
+    def _in_time(self, stream: str, samples: Columns, good: np.ndarray | None = None, *, tell: bool = True) -> Timed:
         found = timed(samples, self._epoch, good)
         if found.dropped:
-            self._losses.append(f"{stream}: {found.dropped} messages left out, their times cannot be right")
+            self._losses.append(
+                f"{stream}: {found.dropped} of {len(samples)} messages have an impossible time and were left out"
+            )
         if found.note and tell:
             self._losses.append(f"{stream}: {found.note}")
         return found
 
-    def _positions(self, topic: str, samples: Samples) -> Positions:
+    def _positions(self, topic: str, samples: Columns) -> Positions:
         lost = self._of.lost_fixes[topic]
         if lost:
-            self._losses.append(f"{topic}: {lost} of {lost + len(samples)} messages without a fix left out")
+            self._losses.append(f"{topic}: {lost} of {lost + len(samples)} messages have no fix and were left out")
         found = self._in_time(topic, samples)
         n = len(found.time_ns)
         latitude, longitude, altitude, level, up, breaks = found.values.T.copy()
@@ -130,18 +126,15 @@ class _Maker:
             fused=False,
         )
 
-    def _rotations(self, stream: str, samples: Samples, first: int) -> tuple[Timed, Floats]:
+    def _rotations(self, stream: str, samples: Columns, first: int) -> tuple[Timed, Floats]:
         """Rows whose numbers are a pose: finite, with a quaternion that is near a unit one, made so."""
         values = samples.values
-        with np.errstate(over="ignore", invalid="ignore"):
-            length = np.linalg.norm(values[:, first:], axis=1)
-        good = np.all(np.isfinite(values), axis=1) & (np.abs(length - 1.0) < 0.1)
+        good = np.all(np.isfinite(values), axis=1) & is_rotation(values[:, first:])
         bad = len(good) - int(np.count_nonzero(good))
         if bad:
-            self._losses.append(f"{stream}: {bad} of {len(good)} messages hold no rotation and are left out")
+            self._losses.append(f"{stream}: {bad} of {len(good)} messages hold no rotation and were left out")
         found = self._in_time(stream, samples, good)
-        q_wxyz = found.values[:, first:]
-        return found, q_wxyz / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+        return found, unit(found.values[:, first:])
 
     def _attitudes(self, transforms: tuple[FixedTransform, ...]) -> tuple[Attitudes, ...]:
         """Attitudes of the body where the bag says how the sensor is mounted on it, else of the sensor."""
@@ -157,7 +150,7 @@ class _Maker:
             self._attitude_frames[topic] = frame if mount is None else _BODY
         return tuple(out)
 
-    def _poses(self, key: Edge, samples: Samples, stream: str) -> LocalPoses:
+    def _poses(self, key: Edge, samples: Columns, stream: str) -> LocalPoses:
         found, q_wxyz = self._rotations(stream, samples, 3)
         return LocalPoses(
             stream=stream,
@@ -181,11 +174,10 @@ class _Maker:
                 fixed.setdefault(key, values[0])
         out = []
         for (topic, parent, child), values in fixed.items():
-            length = float(np.linalg.norm(values[3:]))
-            if np.all(np.isfinite(values)) and abs(length - 1.0) < 0.1:
-                out.append(FixedTransform(parent, child, values[:3], values[3:] / length, topic))
+            if np.all(np.isfinite(values)) and is_rotation(values[3:]):
+                out.append(FixedTransform(parent, child, values[:3], unit(values[3:]), topic))
             else:
-                self._losses.append(f"{topic} {parent}>{child}: no rotation, left out")
+                self._losses.append(f"{topic} {parent}>{child}: no rotation, it was left out")
         for (topic, parent, child), changes in self._of.static_changes.items():
             if changes:
                 self._losses.append(f"{topic} {parent}>{child}: changes {changes} times, the last one is used")
@@ -228,12 +220,13 @@ class _Maker:
         for topic, held in self._of.calibrations.items():
             # One message is a calibration and no more.
             if len(held.samples) > 1 and not self._has_images(topic, held):
-                out.append(self._exposures(topic, held.samples, _REPORTED_SIGMA_S, feedback=True))
+                # The camera stamps it as it would the image.
+                out.append(self._exposures(topic, held.samples, FEEDBACK_SIGMA_S, feedback=True))
         for topic, samples in self._of.triggers.items():
-            out.append(self._exposures(topic, samples, _TRIGGERED_SIGMA_S, feedback=False))
+            out.append(self._exposures(topic, samples, _TRIGGER_LINE_SIGMA_S, feedback=False))
         return tuple(stream for stream in out if len(stream.time_ns))
 
-    def _exposures(self, topic: str, samples: Samples, sigma_s: float, *, feedback: bool) -> Events:
+    def _exposures(self, topic: str, samples: Columns, sigma_s: float, *, feedback: bool) -> Events:
         time_ns = self._in_time(topic, samples).time_ns
         return Events(topic, time_ns, np.full(len(time_ns), -1, np.int64), feedback, sigma_s)
 

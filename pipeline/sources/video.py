@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bools, Ints
 from pipeline.sources.files import beside, local_copy, stem
+from pipeline.sources.png import png
 from pipeline.sources.records import NS_PER_S, ImageStream, Nanoseconds
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 VIDEO_SUFFIXES = (".mp4", ".mov")
-_PNG_EFFORT = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,14 +121,14 @@ def read_frames(location: str, times_ns: Sequence[int] | Nanoseconds) -> Iterato
         index = _index(location, container, stream)
         time_ns = index.time_ns
         decoder = _Decoder(container, stream, index)
-        png: tuple[int, bytes] | None = None
+        image: tuple[int, bytes] | None = None
         for wanted in times_ns:
             at = _nearest(time_ns, int(wanted))
-            if png is None or png[0] != at:
+            if image is None or image[0] != at:
                 frame = decoder.frame(at)
-                png = None if frame is None else (at, _png(frame))
-            if png is not None:
-                yield int(time_ns[at]), png[1], ".png"
+                image = None if frame is None else (at, png(frame.to_ndarray(format="bgr24")))
+            if image is not None:
+                yield int(time_ns[at]), image[1], ".png"
 
 
 def srt_beside(location: str) -> str | None:
@@ -174,13 +174,6 @@ def _nearest(time_ns: Nanoseconds, wanted: int) -> int:
     if after == 0 or after == len(time_ns):
         return min(after, len(time_ns) - 1)
     return after - 1 if wanted - time_ns[after - 1] <= time_ns[after] - wanted else after
-
-
-def _png(frame: VideoFrame) -> bytes:
-    import cv2  # noqa: PLC0415 - heavy
-
-    _, encoded = cv2.imencode(".png", frame.to_ndarray(format="bgr24"), [cv2.IMWRITE_PNG_COMPRESSION, _PNG_EFFORT])
-    return encoded.tobytes()
 
 
 def _rotation_deg(container: InputContainer, stream: VideoStream, index: _Index) -> int:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import AnyArray
+from pipeline.sources.png import png
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 # Bytes per channel, channels, and OpenCV's conversion to BGR. OpenCV names a Bayer pattern by the second and third
@@ -112,21 +113,6 @@ def pixels(message: Any) -> AnyArray:
         return image if conversion is None else cv2.cvtColor(image, conversion)
     except cv2.error as error:
         raise ValueError(f"{encoding}: {error}") from error
-
-
-def png(image: AnyArray) -> bytes:
-    """An image as a PNG file; fast rather than small.
-
-    Raises:
-        ValueError: No image that PNG can hold.
-    """
-    try:
-        good, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    except cv2.error as error:
-        raise ValueError(str(error)) from error
-    if not good:
-        raise ValueError("no image")
-    return data.tobytes()
 
 
 def payload(data: Any) -> memoryview:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from pipeline.sources.bags.images import UnknownEncodingError, payload, png
+from pipeline.sources.bags.images import UnknownEncodingError, payload
+from pipeline.sources.png import png
 
 _CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp8": "vp8", "vp9": "vp9", "av1": "libdav1d"}
 _WAITING = 64

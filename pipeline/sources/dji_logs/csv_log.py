@@ -55,7 +55,7 @@ def read(location: str) -> FlightLog:
     time_ns, rows = _clock(table, losses)
     if not len(rows):
         raise InputError(
-            "E-DJI-CSV-03", "the flight CSV has no readable row", where=location, found=f"{table.rows} rows",
+            "E-DJI-03", "the flight CSV has no readable row", where=location, found=f"{table.rows} rows",
             expected="one row per instant, with its time", hint="export it again",
         )  # fmt: skip
     facts: dict[str, Any] = {}

@@ -53,7 +53,7 @@ def read(location: str) -> FlightLog:
     if 0 < version < 100:
         found += f", log version {version}" + (": encrypted by DJI" if version >= _ENCRYPTED_SINCE else "")
     raise InputError(
-        "E-DJI-TXT-01", "DJI flight records cannot be read: since log version 13 DJI encrypts them", where=location,
+        "E-DJI-04", "DJI flight records cannot be read: since log version 13 DJI encrypts them", where=location,
         found=found, expected="a CSV made from it",
         hint="upload it to airdata.com or phantomhelp.com/logviewer and download the CSV, or run dji-log-parser with "
         "an API key of your own (dji-log --csv flight.csv --api-key KEY RECORD.txt); then name the CSV instead",

@@ -110,7 +110,7 @@ def read_table(location: str, stream: BinaryIO) -> Table:
     layout = layout_of(header)
     if layout is None:
         raise InputError(
-            "E-DJI-CSV-01", "not the header of a DJI flight CSV", where=location,
+            "E-DJI-01", "not the header of a DJI flight CSV", where=location,
             found=", ".join(header.names)[:120] or "no header",
             expected="columns of AirData (time(millisecond), latitude, ..), DatCon (Clock:offsetTime, GPS:Lat, ..) or "
             "a flight record (OSD.latitude, ..)",
@@ -129,7 +129,7 @@ def _table(location: str, layout: Layout, header: Header) -> Table:
     columns = {name: column for name, column in found.items() if column is not None}
     if "time_s" not in columns:
         raise InputError(
-            "E-DJI-CSV-02", "the flight CSV has no time column", where=location,
+            "E-DJI-02", "the flight CSV has no time column", where=location,
             found=", ".join(header.names)[:120], expected=" or ".join(layout.time), hint="export it again with times",
         )  # fmt: skip
     foreign = sorted({text for names, dimension in wanted.values() if (text := header.foreign(names, dimension))})

@@ -24,10 +24,11 @@ from pipeline.sources.records import Events
 _TRUSTED_SIGMA_S = 2.0
 _STATED_SIGMA_S = 0.4
 # Which time tags say UTC: the others are a local time whose zone nobody wrote down.
-TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone", "header stamp"})
+TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone"})
 _LEAST_SHARE = 0.5
 _HEADER_SIGMA_S = 0.001
 _QUARTER_S = 900
+_FINEST_TICK_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +40,14 @@ class PhotoTimes:
         time_ns: (n,) on the camera's clock, read as UTC.
         tick_s: Resolution of that clock.
         trusted: Whether the clock says UTC itself.
+        of_log: Whether they came out of a log or video, and have its clock.
     """
 
     records: tuple[PhotoRecord, ...]
     time_ns: Nanoseconds
     tick_s: float
     trusted: bool
+    of_log: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,23 @@ def photo_times(records: Sequence[PhotoRecord]) -> PhotoTimes:
     timed = sorted((r for r in records if r.time is not None), key=_by_time)
     times = np.array([_ns(r.time) for r in timed if r.time is not None], np.int64)
     return PhotoTimes(tuple(timed), times, _tick_s(times), all(r.time_source in TRUSTED for r in timed))
+
+
+def image_times(records: Sequence[PhotoRecord], line: Timeline, log_ns: Sequence[int]) -> PhotoTimes:
+    """Images that came out of a log or video, on its clock.
+
+    Args:
+        records: The images.
+        line: What they came out of.
+        log_ns: Their instants on its own clock.
+
+    Returns:
+        The images by time: UTC where something ties that clock to it, else since the log or video began.
+    """
+    order = sorted(range(len(records)), key=lambda k: (log_ns[k], records[k].frame_id))
+    time_ns = line.utc_ns(np.array([log_ns[k] for k in order], np.int64))
+    # Such instants are exact: that they lie on whole seconds or frames says nothing of the clock's resolution.
+    return PhotoTimes(tuple(records[k] for k in order), time_ns, _FINEST_TICK_S, line.clock is not None, of_log=True)
 
 
 def _by_time(record: PhotoRecord) -> tuple[int, str]:
@@ -234,9 +254,10 @@ def _by_places(photos: PhotoTimes, line: Timeline) -> ClockMatch | Refusal:
     if fit.problem:
         return Refusal((fit.problem,))
     at_ns = base_log + np.rint((photo_s + fit.offset_s) * 1e9).astype(np.int64)
+    what = "images" if photos.of_log else "photos"
     sigma_s = float(np.hypot(fit.sigma_s, photos.tick_s / np.sqrt(12.0)))
     return _by_offset(
-        photos, line, at_ns, sigma_s, f"positions of {fit.anchors} photos on {line.positions.stream}",
+        photos, line, at_ns, sigma_s, f"positions of {fit.anchors} {what} on {line.positions.stream}",
         fit.offset_s + (base_log - base_photo) / 1e9, fit.anchors,
         f"no camera events: positions tell the clock to {fit.sigma_s:.2f} s",
     )  # fmt: skip
@@ -248,13 +269,14 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
     if line.clock is None:
         return Refusal(("the log knows no UTC",))
     if stream is None or not len(photos.time_ns) or (stated_s is None and not photos.trusted):
-        return Refusal(("the photos do not say their time zone",))
-    header = all(record.time_source == "header stamp" for record in photos.records)
+        return Refusal(("their own log knows no UTC" if photos.of_log else "the photos do not say their time zone",))
+    header = photos.of_log and stated_s is None
     offset_s = stated_s or 0.0
     at_ns = photos.time_ns + round((offset_s + (0.0 if header else photos.tick_s / 2.0)) * 1e9)
     shared_ns = line.utc_ns(stream.time_ns)
     if not np.any((at_ns >= shared_ns[0]) & (at_ns <= shared_ns[-1])):
-        return Refusal((no_overlap_hint(photos, int(shared_ns[0]), int(shared_ns[-1])),))
+        what = "images" if photos.of_log else "photos"
+        return Refusal((no_overlap_hint(photos.time_ns, int(shared_ns[0]), int(shared_ns[-1]), what),))
     sigma_s = _HEADER_SIGMA_S if header else float(np.hypot(_STATED_SIGMA_S, photos.tick_s / np.sqrt(12.0)))
     method = "stated by the user" if stated_s is not None else f"said by the files ({photos.records[0].time_source})"
     note = "" if header else "nothing checks this offset: no camera events, no positions"
@@ -278,18 +300,25 @@ def _by_offset(
     )  # fmt: skip
 
 
-def no_overlap_hint(photos: PhotoTimes, first_ns: int, last_ns: int) -> str:
-    """Which whole quarter of an hour would put most photos inside the log, as a sentence."""
+def no_overlap_hint(time_ns: Nanoseconds, first_ns: int, last_ns: int, what: str) -> str:
+    """Which whole quarter of an hour would put most photos inside the log, as a sentence.
+
+    Args:
+        time_ns: (n,) of the photos, read as UTC.
+        first_ns: Begin of the log, UTC.
+        last_ns: Its end.
+        what: "photos" or "images", for people.
+    """
     quarters = np.arange(-14 * 4, 14 * 4 + 1) * _QUARTER_S
     inside = []
     for quarter_s in quarters.tolist():
-        at_ns = photos.time_ns + quarter_s * 1_000_000_000
+        at_ns = time_ns + quarter_s * 1_000_000_000
         inside.append(int(np.count_nonzero((at_ns >= first_ns) & (at_ns <= last_ns))))
     best = int(np.argmax(inside))
     if not inside[best]:
-        return "photo times and log times do not overlap, whatever the time zone"
+        return f"times of {what} and log do not overlap, whatever the time zone"
     return (
-        f"an offset of {int(quarters[best])} s would put {inside[best]} of {len(photos.records)} photos inside the "
+        f"an offset of {int(quarters[best])} s would put {inside[best]} of {len(time_ns)} {what} inside the "
         f"log: --set ingest.clock_offset_s={int(quarters[best])}"
     )
 
@@ -313,4 +342,4 @@ def _tick_s(time_ns: Nanoseconds) -> float:
     for tick_ns in (1_000_000_000, 100_000_000, 10_000_000, 1_000_000):
         if np.all(time_ns % tick_ns == 0):
             return tick_ns / 1e9
-    return 1e-6
+    return _FINEST_TICK_S

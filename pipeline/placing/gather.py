@@ -13,6 +13,7 @@ from pipeline.clocks.fit import Nanoseconds
 from pipeline.engine.errors import InputError, UndeterminedError
 from pipeline.flight import RUN_IMAGES
 from pipeline.geometry.arrays import Ints
+from pipeline.placing.clock import no_overlap_hint
 from pipeline.placing.place import Stamp
 from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import Timeline
@@ -35,6 +36,7 @@ class Extracted:
         log_ns: Its instant on that log's clock.
         camera: Its calibration as the log has it; None when it has none.
         note: What to distrust of its time.
+        problem: Why there is no such image although there should be; empty when it was written.
     """
 
     path: Path
@@ -42,6 +44,7 @@ class Extracted:
     log_ns: int
     camera: SourcedCamera | None
     note: str
+    problem: str = ""
 
 
 def find_logs(names: str | Sequence[str] | None) -> list[str]:
@@ -85,13 +88,19 @@ def files_of(locations: Sequence[str]) -> list[str]:
     return out
 
 
-def image_stream(log: FlightLog, topic: str | None) -> ImageStream | None:
+def image_stream(log: FlightLog, topic: str | None) -> ImageStream:
     """The images of a bag: those of the named topic, else the longest stream.
 
     Raises:
-        InputError: There are images, but none of that topic.
+        InputError: There are no images, or none of that topic.
     """
-    if topic is not None and log.images:
+    if not log.images:
+        raise InputError(
+            "E-BAG-24", "the bag has no images", where=log.location,
+            found=", ".join(sorted(log.counts)[:20]) or "no topics", expected="a topic of images",
+            hint="a bag that has the poses of other images belongs in ingest.logs (--logs)",
+        )  # fmt: skip
+    if topic is not None:
         named = [stream for stream in log.images if stream.stream == topic]
         if not named:
             raise InputError(
@@ -99,7 +108,39 @@ def image_stream(log: FlightLog, topic: str | None) -> ImageStream | None:
                 expected=", ".join(stream.stream for stream in log.images), hint="set ingest.image_topic",
             )  # fmt: skip
         return named[0]
-    return min(log.images, key=lambda s: (-len(s.time_ns), s.stream)) if log.images else None
+    return min(log.images, key=lambda s: (-len(s.time_ns), s.stream))
+
+
+def check_names(locations: Sequence[str]) -> None:
+    """Refuses two bags or videos of one name: their images would be called the same.
+
+    Raises:
+        InputError: There are such.
+    """
+    seen: dict[str, str] = {}
+    for location in locations:
+        name = file_name(location, 0, "").lower()
+        if name in seen:
+            raise InputError(
+                "E-VIDEO-11", "two videos or bags have one name", where=f"{seen[name]} and {location}",
+                expected="one of each name: their images are named after them",
+                hint="ingest one folder at a time, or rename one (a video together with its .SRT)",
+            )  # fmt: skip
+        seen[name] = location
+
+
+def check_pose_topic(logs: Sequence[FlightLog], topic: str | None) -> None:
+    """Refuses a topic of poses that no log has: other poses in its stead would be nobody's wish.
+
+    Raises:
+        InputError: There is no such topic.
+    """
+    known = sorted({poses.stream for log in logs for poses in log.poses})
+    if topic is not None and topic not in known:
+        raise InputError(
+            "E-BAG-25", "no log has poses of this topic", where=", ".join(log.location for log in logs), found=topic,
+            expected=", ".join(known) or "poses in a local frame, and there are none", hint="set ingest.pose_topic",
+        )  # fmt: skip
 
 
 def calibration_of(log: FlightLog, frame: str) -> SourcedCamera | None:
@@ -110,7 +151,14 @@ def calibration_of(log: FlightLog, frame: str) -> SourcedCamera | None:
 
 
 def wanted(
-    number: int, lines: Sequence[Timeline], stream: ImageStream, mount: Mount, spacing_m: float, *, y_up: bool
+    number: int,
+    lines: Sequence[Timeline],
+    stream: ImageStream,
+    mount: Mount,
+    spacing_m: float,
+    *,
+    clock_offset_s: float | None,
+    y_up: bool,
 ) -> Ints:
     """Which images of a stream to use: one every `spacing_m` of the way, by whichever log knows where it was.
 
@@ -120,6 +168,7 @@ def wanted(
         stream: The images.
         mount: The camera on the vehicle.
         spacing_m: Way between two images, m.
+        clock_offset_s: What the user says makes the images' times UTC, s, for logs other than their own; None for none.
         y_up: Whether the y axis of a local frame points up.
 
     Returns:
@@ -130,20 +179,43 @@ def wanted(
     """
     own = lines[number]
     others = [line for line in lines if line is not own and line.clock is not None and own.clock is not None]
+    stated_ns = round((clock_offset_s or 0.0) * 1e9)
     for line in [own, *others]:
         if line.places:
-            centres = camera_poses(line, on_clock_of(line, own, stream.time_ns), mount, y_up=y_up).centre_m
-            chosen = spaced(centres, spacing_m)
+            at_ns = stream.time_ns if line is own else on_clock_of(line, own, stream.time_ns + stated_ns)
+            chosen = spaced(camera_poses(line, at_ns, mount, y_up=y_up).centre_m, spacing_m)
             if len(chosen):
                 return chosen
-    raise UndeterminedError(
+    raise _nowhere(own, [line for line in others if line.places], stream)
+
+
+def _nowhere(own: Timeline, others: Sequence[Timeline], stream: ImageStream) -> UndeterminedError:
+    """When the images were taken and when the logs know positions, and the offset that would help."""
+    found = [f"{len(stream.time_ns)} images of {stream.stream}, and no positions at their times"]
+    hints = ["name the poses' topic (ingest.pose_topic) or their log (ingest.logs)"]
+    images_ns = own.utc_ns(stream.time_ns)
+    for line in others:
+        poses = line.positions or line.local
+        if poses is not None and len(poses.time_ns) and len(images_ns):
+            first_ns, last_ns = line.utc_ns(poses.time_ns[[0, -1]]).tolist()
+            found.append(
+                f"images {_span(*images_ns[[0, -1]].tolist())}, {line.log.location} {_span(first_ns, last_ns)}"
+            )
+            if not np.any((images_ns >= first_ns) & (images_ns <= last_ns)):
+                hints.append(no_overlap_hint(images_ns, first_ns, last_ns, "images"))
+    return UndeterminedError(
         "E-BAG-21",
         "nothing says where the images were taken",
         where=own.log.location,
-        found=f"{len(stream.time_ns)} images of {stream.stream}, and no positions at their times",
+        found="; ".join(found),
         expected="poses in the same file (topics of poses or GNSS fixes; an .SRT beside a video), or a log with UTC",
-        hint="name the poses' topic (ingest.pose_topic) or their log (ingest.logs)",
+        hint="; ".join(hints),
     )
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    first, last = (datetime.fromtimestamp(t / 1e9, UTC) for t in (first_ns, last_ns))
+    return f"{first:%Y-%m-%d %H:%M:%S} .. {last:%H:%M:%S}"
 
 
 def on_clock_of(line: Timeline, own: Timeline, time_ns: Nanoseconds) -> Nanoseconds:

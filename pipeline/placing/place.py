@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from pipeline.clocks.fit import Nanoseconds
 from pipeline.engine.errors import UndeterminedError
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.rotations import gimbal_angles
-from pipeline.placing.clock import ClockMatch, PhotoTimes, match_clock, photo_times
+from pipeline.placing.clock import ClockMatch, PhotoTimes, image_times, match_clock, photo_times
 from pipeline.placing.missing import unclaimed
 from pipeline.placing.named import by_name
 from pipeline.placing.pose import CameraPoses, camera_poses
@@ -87,8 +88,8 @@ def place(
         if line.places:
             work.by_name(line)
             work.by_stamp(number, line)
-    for camera, group in work.cameras().items():
-        work.by_clock(camera, group)
+    for (clock, _), group in work.clocks_left().items():
+        work.by_clock(clock, group)
     return Placed(
         tuple(work.by_location[record.location] for record in records),
         tuple(work.clocks),
@@ -127,45 +128,64 @@ class _Work:
             at_ns = np.array([self.stamps[record.location].log_ns for record in inside], np.int64)
             self._apply(inside, line, at_ns, np.full(len(inside), _STAMP_SIGMA_S), "log stamp")
 
-    def cameras(self) -> dict[str, list[PhotoRecord]]:
-        """Photos with times of their own that are not settled yet, by camera; each camera has one clock."""
-        out: dict[str, list[PhotoRecord]] = {}
+    def clocks_left(self) -> dict[tuple[str, int], list[PhotoRecord]]:
+        """Images that are not settled yet, by clock: a camera's, or the log's that they came out of (its index)."""
+        out: dict[tuple[str, int], list[PhotoRecord]] = {}
         for record in self.by_location.values():
             stamp = self.stamps.get(record.location)
             settled = record.time_source.startswith("log ") or (
                 stamp is not None and self.lines[stamp.line].places and not record.pose_problem
             )
-            if not settled and not record.image_problem and record.time is not None:
-                out.setdefault(f"{record.make} {record.model}".strip() or "photos", []).append(record)
+            if settled or record.image_problem:
+                continue
+            if stamp is not None:
+                name = PurePosixPath(self.lines[stamp.line].log.location).name
+                out.setdefault((f"images of {name}", stamp.line), []).append(record)
+            elif record.time is not None:
+                out.setdefault((" ".join(f"photos {record.make} {record.model}".split()), -1), []).append(record)
         return out
 
-    def by_clock(self, camera: str, group: Sequence[PhotoRecord]) -> None:
-        """Photos of one camera, log by log, until each has its place.
+    def by_clock(self, clock: str, group: Sequence[PhotoRecord]) -> None:
+        """Images of one clock, log by log, until each has its place.
 
         Raises:
-            UndeterminedError: No log places any, and not all of them know their own place.
+            UndeterminedError: No log places any photo of a camera, and not all of them know their own place.
         """
         waiting, refused = list(group), []
         for line in self.lines:
             asking = [record for record in waiting if not self._came_from(record, line)]
             if not line.places or not asking:
                 continue
-            photos = photo_times(asking)
-            match = match_clock(photos, line, self.clock_offset_s)
+            photos = self._times(asking)
+            match = match_clock(photos, line, self._stated_s(photos))
             if not isinstance(match, ClockMatch):
                 refused.append(f"{line.log.location}: {match}")
                 continue
-            self.clocks.append(_clock_row(camera, line, match))
-            if match.events is not None:
+            self.clocks.append(_clock_row(clock, line, match))
+            if match.events is not None and not photos.of_log:
                 told = unclaimed(photos, match)
                 self.missing.setdefault("photos", []).extend(told.photos)
                 self.missing.setdefault("triggers", []).extend(told.triggers)
             self._placed_by(line, photos, match)
             waiting = [record for record in waiting if self.by_location[record.location] is record]
-        if refused and len(waiting) == len(group):
-            raise _unmatched(camera, group, self.lines, refused)
+        stamped = group[0].location in self.stamps
+        if refused and len(waiting) == len(group) and not stamped:
+            raise _unmatched(clock, group, self.lines, refused)
+        # Frames of one video that no other log fits are rows with their reason: other videos may be well.
+        reason = "; ".join(refused) if stamped and refused else "no log covers its time" if self.clocks else ""
         for record in waiting:
-            self._unplaced(record, "no log covers its time" if self.clocks else "")
+            self._unplaced(record, reason)
+
+    def _times(self, records: Sequence[PhotoRecord]) -> PhotoTimes:
+        """Times of images of one clock."""
+        first = self.stamps.get(records[0].location)
+        if first is None:
+            return photo_times(records)
+        return image_times(records, self.lines[first.line], [self.stamps[r.location].log_ns for r in records])
+
+    def _stated_s(self, photos: PhotoTimes) -> float | None:
+        """The user's offset, which is for clocks that show a time of day: that of a video counts from its start."""
+        return None if photos.of_log and not photos.trusted else self.clock_offset_s
 
     def _came_from(self, record: PhotoRecord, line: Timeline) -> bool:
         stamp = self.stamps.get(record.location)
@@ -256,11 +276,11 @@ def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _clock_row(camera: str, line: Timeline, match: ClockMatch) -> dict[str, Any]:
+def _clock_row(clock: str, line: Timeline, match: ClockMatch) -> dict[str, Any]:
     against = "UTC" if line.clock is not None else "the log's boot"
     return {
-        "clock_id": f"photos {camera}".replace("photos photos", "photos"),
-        "source": "photos",
+        "clock_id": clock,
+        "source": clock.partition(" ")[0],
         "method": f"{match.method}; offset to {against}",
         "offset_s": match.offset_s,
         "sigma_s": match.offset_sigma_s,
@@ -272,13 +292,13 @@ def _clock_row(camera: str, line: Timeline, match: ClockMatch) -> dict[str, Any]
 
 
 def _unmatched(
-    camera: str, group: Sequence[PhotoRecord], lines: Sequence[Timeline], refused: Sequence[str]
+    clock: str, group: Sequence[PhotoRecord], lines: Sequence[Timeline], refused: Sequence[str]
 ) -> UndeterminedError:
     """Both time spans, and why no method brought them together."""
     photos = photo_times(group)
     first, last = photos.records[0], photos.records[-1]
     zone = first.time_source if photos.trusted else "EXIF, no time zone"
-    found = [f"{len(group)} photos ({camera}), {first.time:%Y-%m-%d %H:%M:%S} .. {last.time:%H:%M:%S} ({zone})"]
+    found = [f"{len(group)} {clock}, {first.time:%Y-%m-%d %H:%M:%S} .. {last.time:%H:%M:%S} ({zone})"]
     for line in lines:
         stream = line.positions or line.local
         if stream is not None and len(stream.time_ns):

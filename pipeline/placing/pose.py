@@ -170,9 +170,13 @@ def _unaimed(line: Timeline, mount: Mount) -> str:
     """Why no instant has an attitude; empty when the log and the mount give one."""
     if mount.angles_rad is not None or line.body_from_camera is not None or line.gimbal is not None:
         needs_body = line.gimbal is None or line.gimbal.frame != "ned" or mount.angles_rad is not None
-        return f"{line.log.kind} holds no attitude of the vehicle" if needs_body and line.vehicle is None else ""
+        missing = f"{line.log.kind} holds no attitude of the vehicle: name the log that has it in ingest.logs"
+        return missing if needs_body and line.vehicle is None else ""
     if line.vehicle is None:
-        return f"{line.log.kind} holds no attitude at all: give the log that has it, or photos with their own tags"
+        return (
+            f"{line.log.kind} holds no attitude at all: name the log that has it in ingest.logs, or photos with their "
+            "own tags"
+        )
     return (
         "the log has the vehicle's attitude but no gimbal, and nothing says how the camera is mounted: "
         "--set 'ingest.mount={pitch_deg=-90}' (straight down), or {pitch_deg=-20} and so on"

@@ -12,14 +12,25 @@ from pipeline.engine.stage import Context
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geometry.arrays import Ints
 from pipeline.lidar.sweeps import write_sweeps
-from pipeline.placing.gather import Extracted, as_photo, calibration_of, image_stream, stamp_of, wanted, write_images
+from pipeline.placing.gather import (
+    Extracted,
+    as_photo,
+    calibration_of,
+    check_names,
+    check_pose_topic,
+    file_name,
+    image_stream,
+    stamp_of,
+    wanted,
+    write_images,
+)
 from pipeline.placing.place import Placed, place
 from pipeline.placing.sensors import sensor_poses
 from pipeline.placing.timeline import Timeline, timeline
 from pipeline.sources.bags.payloads import read_images, read_sweeps
 from pipeline.sources.calibration import read_calibration
 from pipeline.sources.exposures import MarkFile
-from pipeline.sources.files import MARK_SUFFIXES, beside, opened
+from pipeline.sources.files import MARK_SUFFIXES, beside, is_url, opened, stem
 from pipeline.sources.intrinsics import SourcedCamera
 from pipeline.sources.logs import read_log
 from pipeline.sources.mrk import read_marks
@@ -30,6 +41,7 @@ from pipeline.tracks.mount import Mount
 
 _SHARD = 32
 _IMAGES = 200
+_UNDECODED = "the {what} is damaged here and the image cannot be decoded: copy the {what} again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +87,7 @@ class Source:
 def read_sources(
     context: Context, logs: Sequence[str], bags: Sequence[str], videos: Sequence[str], wishes: Wishes
 ) -> list[Source]:
-    """Reads logs, then bags with their images, then videos with their subtitles.
+    """Reads logs, then bags with their images, then videos with their subtitles; each file once.
 
     Args:
         context: For progress.
@@ -86,10 +98,25 @@ def read_sources(
 
     Returns:
         The sources in that order.
+
+    Raises:
+        InputError: One cannot be read, has not the images or poses that the user names, or is called as another.
+        UndeterminedError: A video has no subtitles.
     """
-    jobs = [("log", name) for name in logs] + [("bag", name) for name in bags] + [("video", name) for name in videos]
+    check_names([*bags, *videos])
+    read_anyway = {_place(name) for name in [*bags, *map(_subtitles, videos)]}
+    jobs = [("log", name) for name in logs if _place(name) not in read_anyway]
+    jobs += [("bag", name) for name in bags] + [("video", name) for name in videos]
     read = partial(_read_sources, wishes)
-    return [source for part in context.map(read, jobs, shard=1, label="logs") for source in part]
+    sources = [source for part in context.map(read, jobs, shard=1, label="logs") for source in part]
+    if sources:
+        check_pose_topic([source.line.log for source in sources], wishes.pose_topic)
+    return sources
+
+
+def _place(name: str) -> str:
+    """One name for one file, however the user names it."""
+    return name if is_url(name) else str(Path(name).resolve())
 
 
 def _read_sources(wishes: Wishes, jobs: Sequence[tuple[str, str]]) -> list[Source]:
@@ -134,7 +161,10 @@ def extract(context: Context, sources: Sequence[Source], wishes: Wishes) -> list
     jobs = []
     for number, source in enumerate(sources):
         if source.images is not None:
-            chosen = wanted(number, lines, source.images, wishes.mount, wishes.spacing_m, y_up=wishes.y_up)
+            chosen = wanted(
+                number, lines, source.images, wishes.mount, wishes.spacing_m,
+                clock_offset_s=wishes.clock_offset_s, y_up=wishes.y_up,
+            )  # fmt: skip
             # Pieces of a stream are read side by side; each is some hundred images, so that seeking to it pays.
             jobs += [(number, source, chosen[begin : begin + _IMAGES]) for begin in range(0, len(chosen), _IMAGES)]
     take = partial(_take, folder, wishes)
@@ -153,8 +183,11 @@ def _take(folder: Path, wishes: Wishes, jobs: Sequence[tuple[int, Source, Ints]]
             read_frames(location, times_ns) if source.video else read_images(location, stream.stream, times_ns.tolist())
         )
         camera = None if wishes.camera else calibration_of(log, stream.frame)
-        for path, time_ns in write_images(folder, location, chosen, times_ns, images):
-            out.append(Extracted(path, number, time_ns, camera, stream.note))
+        written = {time_ns: path for path, time_ns in write_images(folder, location, chosen, times_ns, images)}
+        for index, time_ns in zip(chosen.tolist(), times_ns.tolist(), strict=True):
+            path = written.get(time_ns, folder / file_name(location, index, ".png"))
+            problem = "" if time_ns in written else _UNDECODED.format(what="video" if source.video else "bag")
+            out.append(Extracted(path, number, time_ns, camera, stream.note, problem))
     return sorted(out, key=lambda image: image.log_ns)
 
 
@@ -176,14 +209,18 @@ def read_photos(
     stated = read_calibration(wishes.camera) if wishes.camera else None
     logged = [calibration_of(source.line.log, "") for source in sources if not source.images]
     of_photos = stated or next((camera for camera in logged if camera is not None), None)
-    jobs = [(name, of_photos) for name in photos] + [(str(image.path), stated or image.camera) for image in images]
+    jobs = [(name, of_photos, "") for name in photos]
+    jobs += [(str(image.path), stated or image.camera, image.problem) for image in images]
     records = [record for part in context.map(_read, jobs, shard=_SHARD, label="photos") for record in part]
     taken = zip(records[len(photos) :], images, strict=True)
     return [*records[: len(photos)], *(as_photo(record, image, sources[image.line].line) for record, image in taken)]
 
 
-def _read(jobs: Sequence[tuple[str, SourcedCamera | None]]) -> list[PhotoRecord]:
-    return [read_photo(location, camera) for location, camera in jobs]
+def _read(jobs: Sequence[tuple[str, SourcedCamera | None, str]]) -> list[PhotoRecord]:
+    return [
+        PhotoRecord(location, stem(location), image_problem=problem) if problem else read_photo(location, camera)
+        for location, camera, problem in jobs
+    ]
 
 
 def placed(

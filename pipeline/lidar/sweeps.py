@@ -22,7 +22,7 @@ pose is known."""
 
 TILE_M = 32.0
 # What is in memory at once: returns of a batch at some 150 bytes each, voxels of a tile at some 100.
-_BATCH_RETURNS, _MOST_VOXELS = 2_000_000, 2_500_000
+_BATCH_RETURNS, _MOST_VOXELS = 1_200_000, 1_500_000
 # A place further off than this is a damaged pose, not a place.
 _FARTHEST_M = 1e6
 _SCALE_M = 0.001

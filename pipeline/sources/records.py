@@ -261,8 +261,9 @@ class FlightLog:
         images: Image streams.
         cameras: Calibrations.
         sweeps: LiDAR streams.
-        losses: What could not be read or was left out, one sentence each; empty when all was read.
-        facts: Other things worth telling (firmware, vehicle, library), JSON values.
+        losses: What could not be read or was left out: sentences in lower case without a full stop, with counts; empty
+            when all was read.
+        facts: Other things worth telling (firmware, vehicle, library): names with their units, JSON values.
     """
 
     location: str

@@ -83,7 +83,7 @@ class McapFile(Bag):
         """As `Bag.messages`."""
         for opcode, begin, length in self._frames():
             if length > MAX_RECORD_BYTES and opcode in {Opcode.CHUNK, Opcode.MESSAGE}:
-                self.losses.append(f"a record of {length} bytes at byte {begin} is left out")
+                self.losses.append(f"a record of {length} bytes at byte {begin} was left out")
             elif opcode == Opcode.CHUNK:
                 if self._worth_reading(begin - _FRAME.size, wanted):
                     yield from self._chunk(self._content(begin, length), wanted)

@@ -120,7 +120,7 @@ class Rosbag1(Bag):
             if op in {_CHUNK, _MESSAGE, _CONNECTION} and length <= MAX_RECORD_BYTES:
                 data = self._stream.read(length)
             elif op in {_CHUNK, _MESSAGE, _CONNECTION}:
-                self.losses.append(f"a record of {length} bytes at byte {begin} is left out")
+                self.losses.append(f"a record of {length} bytes at byte {begin} was left out")
                 continue
             if not whole:
                 self.losses.append(f"the file ends within a record of {length} bytes, of which {len(data)} are there")

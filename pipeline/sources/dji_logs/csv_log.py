@@ -12,7 +12,7 @@ from pipeline.sources.dji_logs.columns import Place, Turn
 from pipeline.sources.dji_logs.streams import attitudes, positions
 from pipeline.sources.dji_logs.table import Table, read_table, recognised
 from pipeline.sources.files import opened
-from pipeline.sources.records import Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase
+from pipeline.sources.records import NS_PER_S, NS_PER_US, Attitudes, Events, FlightLog, Nanoseconds, Positions, TimeBase
 from pipeline.sources.streams import TRIGGER_SIGMA_S, in_order
 
 # A moment further from what most agree on is damaged, or from before the first fix. Late ones do no harm, since the
@@ -83,7 +83,7 @@ def _clock(table: Table, losses: list[str]) -> tuple[Nanoseconds, Ints]:
     rows = np.flatnonzero(timed)
     if len(rows) < len(time_s):
         losses.append(f"{len(time_s) - len(rows)} of {table.rows} rows have no readable time")
-    time_ns = np.rint(time_s[rows] * 1e9).astype(np.int64)
+    time_ns = np.rint(time_s[rows] * NS_PER_S).astype(np.int64)
     ordered = in_order(time_ns)
     if not ordered.all():
         losses.append(f"{np.count_nonzero(~ordered)} of {len(ordered)} rows run backwards in time and were left out")
@@ -120,7 +120,7 @@ def _photos(table: Table, time_ns: Nanoseconds, rows: Ints) -> tuple[Events, ...
     rises = np.flatnonzero(flag & ~np.concatenate(([False], flag[:-1])))
     if not len(rises):
         return ()
-    step_s = float(np.median(np.diff(time_ns))) / 1e9 if len(time_ns) > 1 else 0.0
+    step_s = float(np.median(np.diff(time_ns))) / NS_PER_S if len(time_ns) > 1 else 0.0
     sigma_s = max(step_s / np.sqrt(12.0), TRIGGER_SIGMA_S)
     return (Events("isPhoto", time_ns[rises], np.full(len(rises), -1, np.int64), feedback=False, sigma_s=sigma_s),)
 
@@ -135,7 +135,7 @@ def _time_base(table: Table, start_ns: np.int64) -> TimeBase:
     # The first moment did not change in its row, it was only first seen there.
     later = slice(1, None) if len(time_s) > 1 else slice(None)
     time_s, utc_us = time_s[later], utc_us[later]
-    usable = np.isfinite(time_s) & (np.abs(time_s) < _LONGEST_S) & (time_s * 1e9 >= start_ns)
+    usable = np.isfinite(time_s) & (np.abs(time_s) < _LONGEST_S) & (time_s * NS_PER_S >= start_ns)
     offset_us = utc_us - time_s * 1e6
     if usable.any():
         early_us = offset_us - np.median(offset_us[usable])
@@ -144,7 +144,7 @@ def _time_base(table: Table, start_ns: np.int64) -> TimeBase:
     time_s, utc_us = time_s[usable], utc_us[usable]
     order = np.argsort(time_s, kind="stable")
     return TimeBase(
-        "boot", np.rint(time_s[order] * 1e9).astype(np.int64), np.rint(utc_us[order]).astype(np.int64) * 1000,
+        "boot", np.rint(time_s[order] * NS_PER_S).astype(np.int64), np.rint(utc_us[order]).astype(np.int64) * NS_PER_US,
         late=bool(np.all(utc_us % 1e6 == 0.0)),
         source="rows in which the UTC second changes",
         problem=f"{lost} moments of UTC disagree with the others and were left out" if lost else "",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.sources.records import Nanoseconds
+from pipeline.sources.records import NS_PER_S, Nanoseconds
 
 
 def new_values(columns: Floats, segment: Ints) -> Bools:
@@ -50,7 +50,7 @@ def sloped(time_ns: Nanoseconds, columns: Floats, segment: Ints) -> Floats:
     """
     out = np.array(columns, np.float64)
     new = new_values(columns, segment)
-    seconds = (time_ns - time_ns[:1]) / 1e9
+    seconds = (time_ns - time_ns[:1]) / NS_PER_S
     for c in range(out.shape[1]):
         known = new & np.isfinite(columns[:, c])
         between = ~new & np.isfinite(columns[:, c])

@@ -13,7 +13,7 @@ from pipeline.geometry.arrays import Floats, Ints
 from pipeline.sources.dji_logs.srt_cues import Cues, read_cues
 from pipeline.sources.dji_logs.streams import attitudes, positions
 from pipeline.sources.files import opened
-from pipeline.sources.records import Attitudes, FlightLog, Nanoseconds, Positions, TimeBase
+from pipeline.sources.records import NS_PER_MS, NS_PER_US, Attitudes, FlightLog, Nanoseconds, Positions, TimeBase
 from pipeline.sources.streams import in_order
 from pipeline.sources.time_bases import UNIX_EPOCH
 
@@ -95,7 +95,7 @@ def _clock(cues: Cues, losses: list[str]) -> tuple[Nanoseconds, Ints]:
     elif untimed:
         losses.append(f"{untimed} of {cues.count} cues have no readable time")
     rows = np.flatnonzero(np.isfinite(start_ms))
-    time_ns = np.rint(start_ms[rows] * 1e6).astype(np.int64)
+    time_ns = np.rint(start_ms[rows] * NS_PER_MS).astype(np.int64)
     ordered = in_order(time_ns)
     if not ordered.all():
         losses.append(f"{np.count_nonzero(~ordered)} of {len(ordered)} cues run backwards in time and were left out")
@@ -197,7 +197,7 @@ def _time_base(cues: Cues, time_ns: Nanoseconds, rows: Ints, facts: dict[str, An
     # A whole second shows first in the cue after it began.
     anchors = new[1:] if whole and len(new) > 1 else new
     return TimeBase(
-        "boot", time_ns[anchors], np.rint(local_us[anchors]).astype(np.int64) * 1000,
+        "boot", time_ns[anchors], np.rint(local_us[anchors]).astype(np.int64) * NS_PER_US,
         late=whole, source="date lines that say UTC",
     )  # fmt: skip
 

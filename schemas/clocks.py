@@ -7,9 +7,12 @@ CLOCKS = TableSchema(
     1,
     "Time bases of the sources and what ties them to UTC.",
     (
-        text("clock_id", "Name of the clock."),
-        text("source", "What it times: photos, mrk."),
-        text("method", "How it is tied to UTC: stated by the file, stated by the user, or assumed UTC."),
+        text("clock_id", "Name of the clock: a camera, or a log's file."),
+        text("source", "What it times: photos or images (a camera), mrk, or the format of a log."),
+        text(
+            "method",
+            "How it is tied to UTC: the log's own anchors; for a camera intervals of events, places, or who stated it.",
+        ),
         number("offset_s", "s", "UTC minus the clock's own time."),
         number("sigma_s", "s", "One sigma of the offset.", nullable=True),
         number("drift_ppm", "1e-6", "Drift of the clock against UTC."),

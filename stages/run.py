@@ -29,12 +29,13 @@ def command(
     photos: Annotated[str | None, typer.Option(help="Photo folder, instead of a workflow.")] = None,
     logs: Annotated[list[str] | None, typer.Option(help="Log or bag with the poses; repeatable.")] = None,
     bags: Annotated[list[str] | None, typer.Option(help="Bag whose images are used too; repeatable.")] = None,
-    camera: Annotated[str | None, typer.Option(help="Camera calibration YAML, with --photos.")] = None,
+    videos: Annotated[list[str] | None, typer.Option(help="DJI video with its .SRT beside it; repeatable.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Camera calibration YAML of all images.")] = None,
     lidar: Annotated[str | None, typer.Option(help="LiDAR tiles to score against, with --photos.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Runs every stage the workflow has a section for; what is up to date is skipped."""
-    given = {"photos": photos, "logs": logs, "bags": bags, "camera": camera}
+    given = {"photos": photos, "logs": logs, "bags": bags, "videos": videos, "camera": camera}
     layers = [_sources(workflow, given, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
     configuration = resolve(layers, MODELS)
     if "ingest" not in configuration.sections:
@@ -60,11 +61,11 @@ def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None
                 hint=f"use --set {'score.lidar' if clash[0] == 'lidar' else 'ingest.' + clash[0]}=...",
             )
         return workflow.name, load_workflow(workflow, MODELS)
-    if not (ingest["photos"] or ingest["bags"]):
+    if not (ingest["photos"] or ingest["bags"] or ingest["videos"]):
         raise UsageError(
             "E-RUN-09",
             "nothing to run",
-            expected="WORKFLOW.toml, --photos DIR or --bags FILE",
+            expected="WORKFLOW.toml, --photos DIR, --bags FILE or --videos FILE",
             hint="epitransfer run --help",
         )
     sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}

@@ -24,6 +24,7 @@ def ingest(
     photos: Annotated[str | None, typer.Option(help="Photo folder.")] = None,
     logs: Annotated[list[str] | None, typer.Option(help="Log or bag with the poses; repeatable.")] = None,
     bags: Annotated[list[str] | None, typer.Option(help="Bag whose images are used too; repeatable.")] = None,
+    videos: Annotated[list[str] | None, typer.Option(help="DJI video with its .SRT beside it; repeatable.")] = None,
     camera: Annotated[str | None, typer.Option(help="Camera calibration YAML.")] = None,
     set_: Set = None,
     jobs: Jobs = None,
@@ -34,11 +35,11 @@ def ingest(
     layers: list[tuple[str, Sections]] = []
     if workflow is not None:
         layers.append((workflow.name, load_workflow(workflow, MODELS)))
-    elif not (photos or bags) or folder.workflow.exists():
+    elif not (photos or bags or videos) or folder.workflow.exists():
         layers.append(("run folder", kept_sections(folder)))
     else:
         layers.append(("default", {name: {} for name in STAGES if name != "score"}))
-    named = {"photos": photos, "logs": logs, "bags": bags, "camera": camera}
+    named = {"photos": photos, "logs": logs, "bags": bags, "videos": videos, "camera": camera}
     given = {key: value for key, value in named.items() if value}
     layers.append(("command line", absolute_paths({"ingest": given}, MODELS, Path.cwd())))
     _run("ingest", folder, layers, set_, jobs, scheduler)

@@ -6,11 +6,12 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= runs/$(notdir $(basename $(WORKFLOW)))
 
-.PHONY: help example run test fuzz lint bench pictures clean
+.PHONY: help example run test fuzz lint bench bench-logs pictures clean
 help:
 	@echo "make example                 the built-in flight, from photos to scored points, in runs/example"
 	@echo "make run WORKFLOW=file.toml  a flight of yours, in runs/NAME (OUT=folder to choose)"
 	@echo "make test | lint | bench     the tests, the checks of the code, the timings as ratios"
+	@echo "make bench-logs              every kind of log against the stills, and big logs' speed and memory"
 	@echo "make fuzz                    10,000 damaged copies of a real file for every reader"
 	@echo "make pictures                the pictures of the README, from runs/example"
 	@echo "make clean                   removes runs/, example/ and .venv"
@@ -53,6 +54,11 @@ lint: $(READY)
 bench: $(READY) example/workflow.toml
 	$(BIN)/python benchmarks/kernels.py
 	$(BIN)/python benchmarks/whole_path.py example
+
+# The flight from logs against the flight from stills, and logs of 1 and 5 GB; some ten minutes and 6 GB of disk.
+bench-logs: $(READY) example
+	$(BIN)/python benchmarks/logs_truth.py example runs/example runs/logs
+	$(BIN)/python benchmarks/big_ingest.py runs/big
 
 pictures: $(READY)
 	$(BIN)/python docs/pictures.py runs/example docs

@@ -13,6 +13,7 @@ from typing import Annotated
 import pyproj
 import typer
 
+from pipeline.clocks.gps import TABLE_HOLDS_UNTIL
 from pipeline.engine.errors import UndeterminedError
 from pipeline.engine.executors import usable_cores
 from pipeline.geodesy.heights import Geoid
@@ -28,6 +29,12 @@ REQUIRED = (
     "pydantic",
     "torch",
     "kornia",
+    "pymavlink",
+    "pyulog",
+    "rosbags",
+    "mcap",
+    "av",
+    "pycolmap",
 )
 OPTIONAL = {"distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'"}
 DATUMS = ("egm96", "egm2008")
@@ -40,6 +47,7 @@ def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON objec
         "packages": {name: _version(name) for name in REQUIRED},
         "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
         "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(name) for name in DATUMS}},
+        "leap_seconds_known_until": f"{TABLE_HOLDS_UNTIL:%Y-%m-%d}",
         "cores": usable_cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "disk_free_gib": round(shutil.disk_usage(Path.cwd()).free / 2**30, 1),

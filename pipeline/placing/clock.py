@@ -12,7 +12,8 @@ from datetime import UTC, datetime
 import numpy as np
 
 from pipeline.clocks.fit import Nanoseconds
-from pipeline.clocks.intervals import COARSE_TICK_S, FEWEST_MATCHES, Alignment, align, rivals_of
+from pipeline.clocks.intervals import Alignment, Alignments, align, doubts
+from pipeline.clocks.offsets import COARSE_TICK_S, FEWEST_MATCHES
 from pipeline.clocks.places import offset_by_place
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.placing.pose import level_track
@@ -168,21 +169,23 @@ def _by_events(photos: PhotoTimes, line: Timeline, events: Events, stated_s: flo
     inside = np.count_nonzero((predicted_s > event_s[0] - 1.0) & (predicted_s < event_s[-1] + 1.0))
     if best.matched < max(FEWEST_MATCHES, _LEAST_SHARE * inside):
         return Refusal((f"at best {best.matched} of {len(photos.records)} photos have an event of {events.stream}",))
-    return _matched(photos, line, events, best, predicted_s, event_s, between_s)
+    return _matched(photos, line, events, found, best, photo_s, event_s, between_s)
 
 
 def _matched(
     photos: PhotoTimes,
     line: Timeline,
     events: Events,
+    found: Alignments,
     best: Alignment,
-    predicted_s: Floats,
+    photo_s: Floats,
     event_s: Floats,
     between_s: float,
 ) -> ClockMatch:
     """Photos with an event take its instant; the others the clock's."""
     base_ns = int(line.utc_ns(events.time_ns)[0])
     has = best.event >= 0
+    predicted_s = photo_s * (1.0 + best.drift) + best.offset_s + photos.tick_s / 2.0
     shared_ns = base_ns + np.rint(predicted_s * 1e9).astype(np.int64)
     log_ns = np.where(has, events.time_ns[np.maximum(best.event, 0)], _log_ns(line, shared_ns))
     offset_sigma_s = _offset_sigma_s(best, photos.tick_s)
@@ -190,8 +193,9 @@ def _matched(
     fit_sigma_s = float(np.hypot(offset_sigma_s, within_tick_s))
     sigma_s = np.where(has, events.sigma_s, fit_sigma_s)
     reasons = [""] * len(has)
+    others_of = doubts(photo_s, event_s, photos.tick_s, found, offset_sigma_s)
     for photo in np.flatnonzero(has).tolist():
-        others = rivals_of(photo, float(predicted_s[photo]), best, event_s, photos.tick_s)
+        others = others_of[photo]
         apart = np.abs(event_s[others] - event_s[best.event[photo]])
         if len(others) and float(apart.max()) > 3.0 * events.sigma_s + 0.01:
             reasons[photo] = (

@@ -272,8 +272,10 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
     stream = line.positions if line.positions is not None else line.local
     if line.clock is None:
         return Refusal(("the log knows no UTC",))
-    if stream is None or not len(photos.time_ns) or (stated_s is None and not photos.trusted):
-        return Refusal(("their own log knows no UTC" if photos.of_log else "the photos do not say their time zone",))
+    if stream is None or not len(photos.time_ns):
+        return Refusal(())
+    if stated_s is None and not photos.trusted:
+        return Refusal((_zoneless(photos, line.utc_ns(stream.time_ns)),))
     header = photos.of_log and stated_s is None
     offset_s = stated_s or 0.0
     at_ns = photos.time_ns + round((offset_s + (0.0 if header else photos.tick_s / 2.0)) * 1e9)
@@ -285,6 +287,14 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
     method = "stated by the user" if stated_s is not None else f"said by the files ({photos.records[0].time_source})"
     note = "" if header else "nothing checks this offset: no camera events, no positions"
     return _by_offset(photos, line, at_ns, sigma_s, method, offset_s, 0, note)
+
+
+def _zoneless(photos: PhotoTimes, shared_ns: Nanoseconds) -> str:
+    """What is missing of times without a zone, and the zone that would bring them into the log."""
+    if photos.of_log:
+        return "their own log knows no UTC"
+    hint = no_overlap_hint(photos.time_ns, int(shared_ns[0]), int(shared_ns[-1]), "photos")
+    return f"the photos do not say their time zone; {hint}"
 
 
 def _by_offset(
@@ -320,7 +330,9 @@ def no_overlap_hint(time_ns: Nanoseconds, first_ns: int, last_ns: int, what: str
         inside.append(int(np.count_nonzero((at_ns >= first_ns) & (at_ns <= last_ns))))
     best = int(np.argmax(inside))
     if not inside[best]:
-        return f"times of {what} and log do not overlap, whatever the time zone"
+        days = abs(int(np.median(time_ns)) - (first_ns + last_ns) // 2) / 86_400e9
+        apart = f"{days:.0f} days" if days > 2.0 else f"{24.0 * days:.0f} h"
+        return f"times of {what} and log are {apart} apart, whatever the time zone: is it the log of this flight?"
     return (
         f"an offset of {int(quarters[best])} s would put {inside[best]} of {len(time_ns)} {what} inside the "
         f"log: --set ingest.clock_offset_s={int(quarters[best])}"

@@ -19,6 +19,7 @@ from pipeline.geometry.rotations import (
     ned_from_frd,
     quaternion_from_rotation,
 )
+from pipeline.placing.clock import photo_times
 from pipeline.placing.place import Placed, Stamp, place
 from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import FRD_FROM_FLU, Timeline, timeline
@@ -209,6 +210,27 @@ class TestClock:
         assert "2 triggers fit its time" in found.records[8].problem
         assert sum(bool(record.problem) for record in found.records) == 1
 
+    def test_a_hint_that_would_not_help_is_not_given(self) -> None:
+        # An offset to UTC cannot decide where the log knows no UTC.
+        events = Events("CAM", ns(20.123 + 2.0 * np.arange(20)), np.arange(20), feedback=True, sigma_s=0.001)
+        with pytest.raises(UndeterminedError, match="do not decide") as error:
+            placed(photos(20.123 + 2.0 * np.arange(19), 37.0), log(events=(events,), utc=False))
+        assert "clock_offset_s" not in error.value.hint
+
+    @pytest.mark.parametrize(("source", "sigma_s"), [("utc_at_exposure", 0.4), ("gps", 0.4), ("exif+offset", 2.0)])
+    def test_what_the_files_say_is_as_good_as_their_clock(self, source: str, sigma_s: float) -> None:
+        found = placed(photos(shots(), 0.0, time_source=source), log(events=()))
+        assert found.clocks[0]["sigma_s"] == pytest.approx(sigma_s, rel=0.02)
+        record = found.records[4]
+        assert record.timing is not None
+        assert record.timing.position_m[1] == pytest.approx(SPEED_M_S * sigma_s, rel=0.02)
+
+    def test_names_in_one_second_go_by_their_numbers(self) -> None:
+        records = photos(np.array([1.0, 1.0, 1.0]))
+        names = ("IMG_10", "IMG_9", "IMG_100")
+        found = photo_times([replace(r, frame_id=name) for r, name in zip(records, names, strict=True)])
+        assert [record.frame_id for record in found.records] == ["IMG_9", "IMG_10", "IMG_100"]
+
 
 class TestPose:
     def one(self, mount: Mount = DOWN, at_s: float = 33.33, y_up: bool = False, **parts: object) -> Floats:
@@ -238,6 +260,46 @@ class TestPose:
         assert centre == pytest.approx(along(np.array([33.0]))[0] + (0.5, -0.2, -0.3), abs=1e-4)
         assert poses.ellipsoidal_m[0] == pytest.approx(poses.amsl_m[0] + 48.0)
         assert poses.above_home_m[0] == pytest.approx(49.7, abs=1e-3)
+
+    def test_a_lever_arm_without_the_bodys_attitude(self) -> None:
+        # Left out it would shift every photo, and nobody would know.
+        streams = (attitudes("gimbal", "ned", pitch_deg=-45.0),)
+        found = placed(photos(shots(), 37.0), log(attitudes=streams), mount=Mount(None, (0.5, 0.0, 0.3)))
+        assert all("lever arm needs the vehicle's attitude" in record.problem for record in found.records)
+        found = placed(photos(shots(), 37.0), log(attitudes=streams), mount=Mount())
+        assert not any(record.problem for record in found.records)
+
+    @pytest.mark.parametrize("at_s", [0.0, 0.03, 119.88, 119.9, 30.5])
+    def test_it_moves_at_the_ends_of_a_stream_too(self, at_s: float) -> None:
+        # With no speed the uncertain instant would add nothing to the position's sigma.
+        segment = (np.arange(1200) >= 305).astype(np.int64)
+        turned = np.radians(10.0 * np.arange(1200) / 10.0)
+        q = quaternion_from_rotation(ned_from_frd(turned, np.zeros(1200), np.zeros(1200)))
+        parts = {"positions": (positions(segment=segment),), "attitudes": (attitudes(q_wxyz=q),)}
+        poses = camera_poses(timeline(log(**parts)), ns([at_s]), DOWN)
+        assert not poses.reason[0]
+        assert poses.velocity_m_s[0] == pytest.approx((0.0, SPEED_M_S, 0.0), abs=1e-3)
+        assert np.degrees(np.linalg.norm(poses.turning_rad_s[0])) == pytest.approx(10.0, rel=0.01)
+
+    def test_a_slow_attitude_widens_the_angles(self) -> None:
+        time_s = np.arange(0.0, 120.0, 0.5)
+        yaw = 0.4 * np.sin(2.0 * time_s)
+        q = quaternion_from_rotation(ned_from_frd(yaw, np.zeros(240), np.zeros(240)))
+        slow = attitudes(time_ns=ns(time_s), q_wxyz=q, segment=np.zeros(240, np.int64))
+        at_s = np.arange(20.25, 100.0, 0.5)
+        poses = camera_poses(timeline(log(attitudes=(slow,))), ns(at_s), DOWN)
+        # Straight down the image's top points where the vehicle's nose does.
+        top = -poses.rotation[:, :, 1]
+        missed = np.abs(np.arctan2(top[:, 0], top[:, 1]) - 0.4 * np.sin(2.0 * at_s))
+        assert 0.8 < np.sqrt(np.mean(poses.bend_rad**2)) / np.sqrt(np.mean(missed**2)) < 1.6
+
+    def test_a_height_that_is_not_always_logged(self) -> None:
+        height = positions().ellipsoidal_m + 2.0 * np.arange(1200) / 10.0
+        height[100:130] = np.nan
+        gappy = positions(ellipsoidal_m=height, amsl_m=nothing(1200), above_home_m=nothing(1200))
+        poses = camera_poses(timeline(log(positions=(gappy,))), ns([11.0, 33.0]), DOWN)
+        assert np.isnan(poses.ellipsoidal_m).tolist() == [True, False]
+        assert poses.velocity_m_s[:, 2] == pytest.approx([2.0, 2.0], abs=1e-3)
 
     def test_no_gimbal_and_no_mount(self) -> None:
         found = placed(photos(shots(), 37.0), log(), mount=Mount())
@@ -346,3 +408,28 @@ class TestLocalFrames:
         attitude = found.records[0].attitude
         assert attitude is not None
         assert (attitude.yaw_deg, attitude.pitch_deg) == pytest.approx((20.0, -40.0))
+
+    def named(self, *names: str) -> FlightLog:
+        n = len(names)
+        poses = LocalPoses(
+            "model", np.zeros(n, np.int64), np.arange(3.0 * n).reshape(n, 3), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+            "world", "", "camera", "rdf", names, np.zeros(n, np.int64),
+        )  # fmt: skip
+        return log(positions=(), attitudes=(), events=(), poses=(poses,))
+
+    def placed_x(self, locations: Sequence[str], *names: str) -> list[float | None]:
+        records = photos(np.arange(float(len(locations))))
+        records = [replace(r, location=name, time=None) for r, name in zip(records, locations, strict=True)]
+        found = placed(records, self.named(*names))
+        return [None if record.local_m is None else record.local_m[0] for record in found.records]
+
+    def test_namesakes_in_two_folders(self) -> None:
+        cards = ["/c/100MEDIA/DJI_0001.JPG", "/c/101MEDIA/DJI_0001.JPG"]
+        assert self.placed_x(cards, "101MEDIA/DJI_0001.JPG", "100MEDIA/DJI_0001.JPG") == [3.0, 0.0]
+        assert self.placed_x(cards, "101MEDIA/DJI_0001.JPG") == [None, 0.0]
+        # One name for both: it is one of them, and nobody can tell which.
+        assert self.placed_x(cards, "DJI_0001.JPG") == [None, None]
+        assert self.placed_x(["/c/DJI_0001.JPG"], "100MEDIA/DJI_0001.JPG", "101MEDIA/DJI_0001.JPG") == [None]
+
+    def test_a_name_with_another_ending(self) -> None:
+        assert self.placed_x(["/c/DJI_0001.JPG", "/c/DJI_0002.JPG"], "DJI_0002", "dji_0001.png") == [3.0, 0.0]

@@ -17,7 +17,7 @@ from pipeline.geometry.rotations import (
     vector_from_rotation,
 )
 from pipeline.tracks.mount import Mount, contradiction_deg, heading_only, ned_from_gimbal
-from pipeline.tracks.series import bend, between, bracket, slerp, speed
+from pipeline.tracks.series import bend, between, bracket, slerp, speed, turn_bend
 
 NS = 1_000_000_000
 
@@ -65,7 +65,33 @@ class TestSeries:
         assert speed(values, where)[0] == pytest.approx((8.5, 3.0))
         # The line from 4 to 4.5 misses the parabola by half the second difference's quarter.
         missed = between(values, where)[0, 0] - 4.25**2
-        assert bend(values, where)[0] == pytest.approx((missed, 0.0))
+        told = bend(values, at(*times), np.zeros(len(times), np.int64), where, 1.0)
+        assert told[0] == pytest.approx((missed, 0.0))
+
+    @pytest.mark.parametrize("odd", ["gap", "reset", "twice"])
+    def test_bend_is_not_taken_across_what_is_no_curve(self, odd: str) -> None:
+        times = np.arange(0.0, 10.0, 0.5)
+        if odd == "twice":
+            times[10] = times[9]
+        values, segment = 3.0 * times[:, None], np.zeros(len(times), np.int64)
+        if odd == "gap":
+            times[10:] += 7.0
+        if odd != "twice":
+            values[10:] += 50.0
+        if odd == "reset":
+            segment[10:] = 1
+        where = bracket(at(*times), segment, at(times[10] + 0.2, times[8] + 0.2), 1.5)
+        assert where.known.all()
+        assert np.abs(bend(values, at(*times), segment, where, 1.5)).max() == pytest.approx(0.0, abs=1e-9)
+
+    def test_what_slerp_misses_of_a_turn_that_speeds_up(self) -> None:
+        times = np.arange(0.0, 5.0, 0.5)
+        q = quaternion_from_rotation(ned_from_frd(0.4 * times**2, np.zeros(10), np.zeros(10)))
+        where = bracket(at(*times), np.zeros(10, np.int64), at(2.25), 1.0)
+        yaw = 2.0 * np.arctan2(*slerp(q, where)[0, [3, 0]])
+        missed = abs(yaw - 0.4 * 2.25**2)
+        told = turn_bend(q, at(*times), np.zeros(10, np.int64), where, 1.0)[0]
+        assert told == pytest.approx(missed)
 
     @given(st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3))
     def test_rotation_vectors_come_back(self, vector: list[float]) -> None:

@@ -5,13 +5,14 @@ Order alone never decides which photo is which exposure: one lost frame would sh
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
 
-from pipeline.clocks.fit import Nanoseconds
+from pipeline.clocks.fit import ClockFit, Nanoseconds
 from pipeline.clocks.intervals import Alignment, Alignments, align, doubts
 from pipeline.clocks.offsets import COARSE_TICK_S, FEWEST_MATCHES
 from pipeline.clocks.places import offset_by_place
@@ -26,10 +27,12 @@ _TRUSTED_SIGMA_S = 2.0
 _STATED_SIGMA_S = 0.4
 # Which time tags say UTC: the others are a local time whose zone nobody wrote down.
 TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone"})
+_BY_SATELLITE = frozenset({"utc_at_exposure", "gps"})
 _LEAST_SHARE = 0.5
 _HEADER_SIGMA_S = 0.001
 _QUARTER_S = 900
 _FINEST_TICK_S = 1e-6
+_DIGITS = re.compile(r"(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,14 +115,19 @@ def image_times(records: Sequence[PhotoRecord], line: Timeline, log_ns: Sequence
     Returns:
         The images by time: UTC where something ties that clock to it, else since the log or video began.
     """
-    order = sorted(range(len(records)), key=lambda k: (log_ns[k], records[k].frame_id))
+    order = sorted(range(len(records)), key=lambda k: (log_ns[k], by_number(records[k].frame_id)))
     time_ns = line.utc_ns(np.array([log_ns[k] for k in order], np.int64))
     # Such instants are exact: that they lie on whole seconds or frames says nothing of the clock's resolution.
     return PhotoTimes(tuple(records[k] for k in order), time_ns, _FINEST_TICK_S, line.clock is not None, of_log=True)
 
 
-def _by_time(record: PhotoRecord) -> tuple[int, str]:
-    return (0 if record.time is None else _ns(record.time)), record.frame_id
+def by_number(name: str) -> list[tuple[int, str]]:
+    """A name as a key that puts IMG_9 before IMG_10."""
+    return [(int(part or -1), "") if k % 2 else (0, part) for k, part in enumerate(_DIGITS.split(name))]
+
+
+def _by_time(record: PhotoRecord) -> tuple[int, list[tuple[int, str]]]:
+    return (0 if record.time is None else _ns(record.time)), by_number(record.frame_id)
 
 
 def match_clock(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> ClockMatch | Refusal:
@@ -164,7 +172,10 @@ def _by_events(photos: PhotoTimes, line: Timeline, events: Events, stated_s: flo
     if best is None:
         return Refusal((f"no offset brings three photos to events of {events.stream}",))
     if found.rival is not None:
-        return Refusal((_undecided(events, best, found.rival, between_s, len(photos.records)),))
+        told = _undecided(events, best, found.rival, between_s, len(photos.records))
+        # An offset to UTC says nothing of a clock that counts from the start of the machine.
+        cure = f" (say which: --set ingest.clock_offset_s={best.offset_s + between_s:.1f})" if line.clock else ""
+        return Refusal((f"{told}{cure}",))
     predicted_s = photo_s * (1.0 + best.drift) + best.offset_s + photos.tick_s / 2.0
     inside = np.count_nonzero((predicted_s > event_s[0] - 1.0) & (predicted_s < event_s[-1] + 1.0))
     if best.matched < max(FEWEST_MATCHES, _LEAST_SHARE * inside):
@@ -235,8 +246,7 @@ def _prior(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> tuple[
 def _undecided(events: Events, best: Alignment, rival: Alignment, between_s: float, photos: int) -> str:
     return (
         f"the intervals of {events.stream} do not decide: an offset of {best.offset_s + between_s:+.2f} s fits "
-        f"{best.matched} of {photos} photos, {rival.offset_s + between_s:+.2f} s fits {rival.matched} "
-        f"(say which: --set ingest.clock_offset_s={best.offset_s + between_s:.1f})"
+        f"{best.matched} of {photos} photos, {rival.offset_s + between_s:+.2f} s fits {rival.matched}"
     )
 
 
@@ -283,7 +293,7 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
     if not np.any((at_ns >= shared_ns[0]) & (at_ns <= shared_ns[-1])):
         what = "images" if photos.of_log else "photos"
         return Refusal((no_overlap_hint(photos.time_ns, int(shared_ns[0]), int(shared_ns[-1]), what),))
-    sigma_s = _HEADER_SIGMA_S if header else float(np.hypot(_STATED_SIGMA_S, photos.tick_s / np.sqrt(12.0)))
+    sigma_s = _said_sigma_s(photos, line.clock, stated_s, header=header)
     method = "stated by the user" if stated_s is not None else f"said by the files ({photos.records[0].time_source})"
     note = "" if header else "nothing checks this offset: no camera events, no positions"
     return _by_offset(photos, line, at_ns, sigma_s, method, offset_s, 0, note)
@@ -295,6 +305,18 @@ def _zoneless(photos: PhotoTimes, shared_ns: Nanoseconds) -> str:
         return "their own log knows no UTC"
     hint = no_overlap_hint(photos.time_ns, int(shared_ns[0]), int(shared_ns[-1]), "photos")
     return f"the photos do not say their time zone; {hint}"
+
+
+def _said_sigma_s(photos: PhotoTimes, clock: ClockFit, stated_s: float | None, *, header: bool) -> float:
+    """How far the exposures may be off where nothing checks the offset: both clocks' errors, and the tick."""
+    if header:
+        own_s = _HEADER_SIGMA_S
+    elif stated_s is not None or all(record.time_source in _BY_SATELLITE for record in photos.records):
+        own_s = _STATED_SIGMA_S
+    else:
+        # A zone beside the time does not make the clock right: somebody set it by hand or by telephone.
+        own_s = _TRUSTED_SIGMA_S
+    return float(np.sqrt(own_s**2 + clock.sigma_s**2 + (0.0 if header else photos.tick_s**2 / 12.0)))
 
 
 def _by_offset(

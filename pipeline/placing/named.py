@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -39,14 +38,14 @@ def _local(records: Sequence[PhotoRecord], line: Timeline, mount: Mount, *, y_up
     poses = line.local
     if poses is None:
         return []
-    rows = _rows(poses.image)
+    rows = _rows(records, poses.image)
     centre_m, rotation = camera_in_local_frame(
         line, poses, poses.position_m, poses.q_wxyz, mount_of(line, mount), y_up=y_up
     )
     angles = np.degrees(gimbal_angles(rotation))
     out = []
     for record in records:
-        row = _row_of(record, rows)
+        row = rows.get(record.location)
         if row is not None and np.all(np.isfinite(angles[row])):
             yaw, pitch, roll = angles[row].tolist()
             x, y, z = centre_m[row].tolist()
@@ -67,14 +66,14 @@ def _on_earth(records: Sequence[PhotoRecord], line: Timeline) -> list[PhotoRecor
     positions, attitude = line.positions, line.gimbal
     if positions is None:
         return []
-    rows = _rows(positions.image)
-    turned = {} if attitude is None else _rows(attitude.image)
+    rows = _rows(records, positions.image)
+    turned = {} if attitude is None else _rows(records, attitude.image)
     out = []
     for record in records:
-        row = _row_of(record, rows)
+        row = rows.get(record.location)
         if row is None:
             continue
-        at = _row_of(record, turned)
+        at = turned.get(record.location)
         own = record.attitude
         if attitude is not None and at is not None:
             rotation = ENU_FROM_NED @ rotation_from_quaternion(attitude.q_wxyz[at]) @ FRD_FROM_RDF
@@ -106,18 +105,42 @@ def _on_earth(records: Sequence[PhotoRecord], line: Timeline) -> list[PhotoRecor
     return out
 
 
-def _rows(names: Sequence[str]) -> dict[str, int]:
-    """Row by file name, and by stem where that is unique."""
-    out: dict[str, int] = {}
-    stems: dict[str, list[int]] = {}
+def _rows(records: Sequence[PhotoRecord], names: Sequence[str]) -> dict[str, int]:
+    """The row of each photo, by its location: that of its file name, or of its stem; folders tell namesakes apart.
+
+    Card folders count from DJI_0001 anew: where the names do not tell which of two a photo is, it has no row.
+    """
+    by_stem: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         if name:
-            out[PurePosixPath(name).name.lower()] = row
-            stems.setdefault(PurePosixPath(name).stem.lower(), []).append(row)
-    out.update({stem: rows[0] for stem, rows in stems.items() if len(rows) == 1})
+            by_stem.setdefault(_stem(_parts(name)[0]), []).append(row)
+    claims: dict[int, list[tuple[int, str]]] = {}
+    for record in records:
+        own = _parts(record.location)
+        rows = by_stem.get(_stem(own[0]), [])
+        agree = {row: _agreement(own, _parts(names[row])) for row in rows}
+        best = max(agree.values(), default=0)
+        chosen = [row for row in rows if agree[row] == best]
+        if len(chosen) == 1:
+            claims.setdefault(chosen[0], []).append((best, record.location))
+    out: dict[str, int] = {}
+    for row, claimed in claims.items():
+        best = max(agreed for agreed, _ in claimed)
+        nearest = [location for agreed, location in claimed if agreed == best]
+        if len(nearest) == 1:
+            out[nearest[0]] = row
     return out
 
 
-def _row_of(record: PhotoRecord, rows: dict[str, int]) -> int | None:
-    name = PurePosixPath(record.location.replace("\\", "/")).name.lower()
-    return rows.get(name, rows.get(record.frame_id.lower()))
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0] or name
+
+
+def _parts(name: str) -> list[str]:
+    """A path from its end: file name, folder, folder's folder."""
+    return name.replace("\\", "/").lower().split("/")[::-1]
+
+
+def _agreement(own: Sequence[str], other: Sequence[str]) -> int:
+    """How many parts from the end are the same; 0 where only the stems are."""
+    return next((k for k, (a, b) in enumerate(zip(own, other, strict=False)) if a != b), min(len(own), len(other)))

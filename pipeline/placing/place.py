@@ -249,7 +249,7 @@ def _with_position(record: PhotoRecord, poses: CameraPoses, k: int, sigma_s: flo
     """A photo with a log's position, and what an error of its instant does to the pose."""
     timing = TimingSigmas(
         _triple(np.hypot(np.abs(poses.velocity_m_s[k]) * sigma_s, poses.bend_m[k])),
-        _triple(np.degrees(poses.turning_rad_s[k]) * sigma_s),
+        _triple(np.degrees(np.hypot(poses.turning_rad_s[k] * sigma_s, poses.bend_rad[k]))),
     )
     record = replace(record, timing=timing, pose_problem="")
     if poses.frame is None:

@@ -21,7 +21,7 @@ from pipeline.geometry.rotations import (
 from pipeline.placing.timeline import FRD_FROM_FLU, Timeline, mount_of
 from pipeline.sources.records import Attitudes, LocalPoses, Positions
 from pipeline.tracks.mount import CONTRADICTION_DEG, Mount, contradiction_deg, ned_from_gimbal
-from pipeline.tracks.series import Bracket, bend, between, bracket, slerp
+from pipeline.tracks.series import Bracket, bend, between, bracket, slerp, turn_bend
 
 # Positions come at 1 to 50 Hz, attitudes at 2 Hz and more; over longer gaps a drone may have done anything.
 LONGEST_POSITION_GAP_S = 2.5
@@ -50,6 +50,7 @@ class CameraPoses:
         velocity_m_s: (k, 3) east, north, up.
         turning_rad_s: (k, 3) about the yaw, pitch and roll axes of `gimbal_error_axes`.
         bend_m: (k, 3) what straight lines between samples may miss.
+        bend_rad: (k,) what turning evenly between samples may miss.
         outside: (k,) whether the instant lies before or after the stream altogether.
         reason: Per instant, why there is no pose; empty where there is one.
         source: Streams used, for people.
@@ -67,6 +68,7 @@ class CameraPoses:
     velocity_m_s: Floats
     turning_rad_s: Floats
     bend_m: Floats
+    bend_rad: Floats
     outside: Bools
     reason: tuple[str, ...]
     source: str
@@ -114,24 +116,41 @@ def _on_earth(line: Timeline, positions: Positions, at_ns: Nanoseconds, mount: M
         between(positions.sigma_vertical_m, where),
         velocity,
         turning,
-        bend(track_m, where),
+        bend(track_m, positions.time_ns, positions.segment, where, LONGEST_POSITION_GAP_S),
+        _turn_bend(line, mount, at_ns),
         _outside(at_ns, positions.time_ns),
-        _reasons(at_ns, where, positions, rotation, _unaimed(line, mount)),
+        _reasons(at_ns, where, positions, rotation, _unaimed(line, mount), centre_m),
         f"{line.log.kind}: {' + '.join(stream.stream for stream in streams if stream is not None)}",
         tuple(_contradictions(line, mount, at_ns)),
     )
 
 
+def _turn_bend(line: Timeline, mount: Mount, at_ns: Nanoseconds) -> Floats:
+    """What the attitudes that aim the camera may miss between their samples, (k,) rad."""
+    by_gimbal = mount.angles_rad is None and line.gimbal is not None
+    needs_body = not by_gimbal or (line.gimbal is not None and line.gimbal.frame != "ned")
+    out = np.zeros(len(at_ns))
+    for stream in (line.gimbal if by_gimbal else None, line.vehicle if needs_body else None):
+        if stream is not None:
+            where = bracket(stream.time_ns, stream.segment, at_ns, LONGEST_ATTITUDE_GAP_S)
+            missed = turn_bend(stream.q_wxyz, stream.time_ns, stream.segment, where, LONGEST_ATTITUDE_GAP_S)
+            out = np.hypot(out, missed)
+    return out
+
+
 def level_track(positions: Positions) -> tuple[LocalFrame, Floats]:
     """A stream's positions as metres east, north, up, (n, 3), in a frame at its middle.
 
-    The height is whichever the stream has; zero where it has none.
+    The height is the one that the stream holds most of, lines over what is missing; zero where it has none.
     """
     middle = len(positions.time_ns) // 2
-    heights = (positions.ellipsoidal_m, positions.amsl_m, positions.above_home_m)
-    height = next((h for h in heights if np.all(np.isfinite(h))), None)
-    if height is None:
-        height = np.zeros(len(positions.time_ns))
+    height = max(
+        (positions.ellipsoidal_m, positions.amsl_m, positions.above_home_m),
+        key=lambda h: np.count_nonzero(np.isfinite(h)),
+    )
+    known = np.isfinite(height)
+    row = np.arange(len(height))
+    height = np.interp(row, row[known], height[known]) if known.any() else np.zeros(len(height))
     frame = LocalFrame(
         float(positions.latitude_deg[middle]), float(positions.longitude_deg[middle]), float(height[middle])
     )
@@ -146,7 +165,9 @@ def _path_on_earth(
     body = None if line.vehicle is None else _rotations(line.vehicle, at_ns)
     aimed = _aimed(line, mount, body, at_ns)
     lever_m = np.zeros((len(at_ns), 3))
-    if any(mount.lever_arm_m) and body is not None:
+    if any(mount.lever_arm_m):
+        # Without the body's attitude nobody knows where the arm points: the centre is then NaN.
+        body = np.full((len(at_ns), 3, 3), np.nan) if body is None else body
         lever_m = body @ np.array(mount.lever_arm_m) @ ENU_FROM_NED.T
     return antenna_m + lever_m, ENU_FROM_NED @ aimed @ FRD_FROM_RDF
 
@@ -217,8 +238,10 @@ def _in_local_frame(line: Timeline, poses: LocalPoses, at_ns: Nanoseconds, mount
     )
     return CameraPoses(
         rotation, centre_m, None, unknown, unknown, unknown, unknown, unknown, velocity, turning,
-        bend(poses.position_m, where), _outside(at_ns, poses.time_ns),
-        _reasons(at_ns, where, poses, rotation, missing),
+        bend(poses.position_m, poses.time_ns, poses.segment, where, LONGEST_ATTITUDE_GAP_S),
+        turn_bend(poses.q_wxyz, poses.time_ns, poses.segment, where, LONGEST_ATTITUDE_GAP_S),
+        _outside(at_ns, poses.time_ns),
+        _reasons(at_ns, where, poses, rotation, missing, centre_m),
         f"{line.log.kind}: {poses.stream}",
     )  # fmt: skip
 
@@ -271,13 +294,40 @@ def _rotations(stream: Attitudes, at_ns: Nanoseconds) -> Floats:
 
 
 def _changes(path: Path, at_ns: Nanoseconds, rotation: Floats) -> tuple[Floats, Floats]:
-    """Velocity (k, 3) m/s, and turning (k, 3) rad/s about the gimbal's error axes; 0 at the ends of a stream."""
-    (before_m, before), (after_m, after) = path(at_ns - _HALF_NS), path(at_ns + _HALF_NS)
+    """Velocity (k, 3) m/s, and turning (k, 3) rad/s about the gimbal's error axes.
+
+    At an end of a stream, and beside a gap or a reset, by the side that is known; a lone sample moves as fast as the
+    fastest of the others.
+    """
     seconds = 2.0 * _HALF_NS / 1e9
-    turned = vector_from_rotation(np.nan_to_num(after @ np.swapaxes(before, -1, -2)))
+    (before_m, before), (here_m, here), (after_m, after) = (path(at_ns + side * _HALF_NS) for side in (-1, 0, 1))
+    velocity = (after_m - before_m) / seconds
+    for one_side in (after_m - here_m, here_m - before_m):
+        velocity = np.where(np.isfinite(velocity), velocity, 2.0 * one_side / seconds)
+    turned = _turned(after, before)
+    for other in (_turned(after, here), _turned(here, before)):
+        turned = np.where(np.isfinite(turned), turned, 2.0 * other)
     axes = gimbal_error_axes(np.nan_to_num(rotation))
     about = np.abs(np.einsum("kij,ki->kj", axes, turned)) / seconds
-    return np.nan_to_num((after_m - before_m) / seconds), np.nan_to_num(about)
+    return _filled(velocity), _filled(about)
+
+
+def _turned(after: Floats, before: Floats) -> Floats:
+    """Rotation vectors between attitudes, (k, 3); NaN where one is not known."""
+    apart = after @ np.swapaxes(before, -1, -2)
+    known = np.all(np.isfinite(apart), axis=(-2, -1))
+    out: Floats = np.where(
+        known[:, None], vector_from_rotation(np.where(known[:, None, None], apart, np.eye(3))), np.nan
+    )
+    return out
+
+
+def _filled(values: Floats) -> Floats:
+    """The greatest known of each column where a value is not known; 0 where none is."""
+    known = np.isfinite(values)
+    most = np.max(np.abs(np.where(known, values, 0.0)), axis=0, initial=0.0)
+    out: Floats = np.where(known, values, most)
+    return out
 
 
 def _outside(at_ns: Nanoseconds, time_ns: Nanoseconds) -> Bools:
@@ -286,7 +336,12 @@ def _outside(at_ns: Nanoseconds, time_ns: Nanoseconds) -> Bools:
 
 
 def _reasons(
-    at_ns: Nanoseconds, where: Bracket, stream: Positions | LocalPoses, rotation: Floats, unaimed: str
+    at_ns: Nanoseconds,
+    where: Bracket,
+    stream: Positions | LocalPoses,
+    rotation: Floats,
+    unaimed: str,
+    centre_m: Floats,
 ) -> tuple[str, ...]:
     out = []
     first, last = (stream.time_ns[0], stream.time_ns[-1]) if len(stream.time_ns) else (0, 0)
@@ -301,6 +356,8 @@ def _reasons(
             out.append(unaimed)
         elif not np.all(np.isfinite(rotation[k])):
             out.append("exposed in a gap of the attitude")
+        elif not np.all(np.isfinite(centre_m[k])):
+            out.append("the lever arm needs the vehicle's attitude, which the log does not hold at this instant")
         else:
             out.append("")
     return tuple(out)

@@ -5,12 +5,14 @@ Interpolation never crosses a gap or a reset of the estimator; an instant outsid
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.rotations import rotation_from_quaternion, vector_from_rotation
 
 Nanoseconds = npt.NDArray[np.int64]
 
@@ -123,23 +125,58 @@ def speed(values: Floats, where: Bracket) -> Floats:
     return out
 
 
-def bend(values: Floats, where: Bracket) -> Floats:
-    """What a straight line between samples may miss of a curve: the second difference's share at the instants.
+def bend(values: Floats, time_ns: Nanoseconds, segment: Ints, where: Bracket, longest_gap_s: float) -> Floats:
+    """What a straight line between samples may miss of a curve: what its slope changes by, and for how long.
 
     Args:
         values: (n, d) of the stream.
+        time_ns: (n,) of the stream.
+        segment: (n,) a change of slope is not taken across a change of it.
         where: Brackets of k instants.
+        longest_gap_s: Nor across samples further apart than this.
 
     Returns:
         (k, d), not negative; 0 where the stream is too short to tell.
     """
-    if len(values) < 4:
+    if len(values) < 3:
         return np.zeros((len(where.left), values.shape[1]))
-    before, after = np.maximum(where.left - 1, 0), np.minimum(where.right + 1, len(values) - 1)
-    first = values[where.left] - values[before]
-    middle = values[where.right] - values[where.left]
-    last = values[after] - values[where.right]
-    second = np.maximum(np.abs(middle - first), np.abs(last - middle))
-    share = 0.5 * where.weight * (1.0 - where.weight)
-    out: Floats = np.where(where.known[:, None], share[:, None] * second, 0.0)
+    return _missed(lambda first, last: values[last] - values[first], time_ns, segment, where, longest_gap_s)
+
+
+def turn_bend(q_wxyz: Floats, time_ns: Nanoseconds, segment: Ints, where: Bracket, longest_gap_s: float) -> Floats:
+    """What interpolation along the great circle may miss of a turn, rad; arguments as of `bend`.
+
+    Returns:
+        (k,) rad, not negative.
+    """
+    if len(q_wxyz) < 3:
+        return np.zeros(len(where.left))
+
+    def turned(first: Ints, last: Ints) -> Floats:
+        before, after = (rotation_from_quaternion(q_wxyz[index]) for index in (first, last))
+        return vector_from_rotation(np.swapaxes(before, -1, -2) @ after)
+
+    out: Floats = np.linalg.norm(_missed(turned, time_ns, segment, where, longest_gap_s), axis=1)
     return out
+
+
+def _missed(
+    way: Callable[[Ints, Ints], Floats], time_ns: Nanoseconds, segment: Ints, where: Bracket, longest_gap_s: float
+) -> Floats:
+    """What even motion between samples misses, (k, d), by how the speeds before and after differ from that between."""
+    before, after = np.maximum(where.left - 1, 0), np.minimum(where.right + 1, len(time_ns) - 1)
+
+    def speeds(first: Ints, last: Ints) -> tuple[Floats, Floats, Bools]:
+        step_s = (time_ns[last] - time_ns[first]).astype(np.float64) / 1e9
+        known: Bools = (step_s > 0.0) & (step_s <= longest_gap_s) & (segment[first] == segment[last])
+        return way(first, last) / np.where(step_s > 0.0, step_s, 1.0)[:, None], step_s, known
+
+    middle, step_s, _ = speeds(where.left, where.right)
+    out = np.zeros_like(middle)
+    for first, last in ((before, where.left), (where.right, after)):
+        beside, apart_s, known = speeds(first, last)
+        # A constant acceleration a misses a w (1 - w) h^2 / 2 of a step h.
+        turned = np.abs(middle - beside) / np.maximum((step_s + apart_s) / 2.0, 1e-9)[:, None]
+        missed = (0.5 * where.weight * (1.0 - where.weight) * step_s**2)[:, None] * turned
+        out = np.fmax(out, np.where(known[:, None], missed, 0.0))
+    return np.where(where.known[:, None], out, 0.0)

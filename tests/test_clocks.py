@@ -249,6 +249,43 @@ class TestPlaces:
         assert fit.offset_s == pytest.approx(-7200.4, abs=0.1)
         assert 0.05 < fit.sigma_s < 0.3
 
+    def test_two_flights_over_the_same_field(self) -> None:
+        time_s, track_m = self.track()
+        at = np.linspace(40.0, 250.0, 12)
+        places = np.column_stack([np.interp(at, time_s, track_m[:, k]) for k in range(2)])
+        # The longer flight is not in the log; it went the other way round.
+        fit = offset_by_place(
+            np.concatenate([at, 4000.0 + np.linspace(0.0, 200.0, 18)]),
+            np.concatenate([places, np.column_stack([np.linspace(1000.0, 300.0, 18), np.zeros(18)])]),
+            time_s,
+            track_m,
+        )
+        assert fit is not None
+        assert not fit.problem
+        assert fit.offset_s == pytest.approx(0.0, abs=0.2)
+
+    def test_a_flight_that_mostly_hovers(self) -> None:
+        rng = np.random.default_rng(5)
+        time_s = np.arange(0.0, 300.0, 0.2)
+        track_m = np.column_stack(
+            [np.interp(time_s, [0, 100, 110, 200, 225, 300], [0, 0, 40, 40, 140, 140]), 0 * time_s]
+        )
+        at = np.linspace(5.0, 290.0, 40)
+        places = np.column_stack([np.interp(at, time_s, track_m[:, k]) for k in range(2)])
+        errors, claims = [], []
+        for _ in range(20):
+            fit = offset_by_place(at + 50.0, places + rng.normal(0.0, 0.7, places.shape), time_s, track_m)
+            assert fit is not None
+            assert not fit.problem
+            errors.append(fit.offset_s + 50.0)
+            claims.append(fit.sigma_s)
+        # The claim holds a lag that these photos have not.
+        assert 0.3 < np.std(errors) / np.mean(claims) < 1.3
+
+    def test_photos_over_a_longer_time_than_the_track(self) -> None:
+        time_s, track_m = self.track()
+        assert offset_by_place(np.array([0.0, 400.0, 900.0]), track_m[[0, 5, 9]], time_s, track_m) is None
+
     def test_photos_of_another_place(self) -> None:
         time_s, track_m = self.track()
         fit = offset_by_place(np.linspace(0.0, 60.0, 9), np.full((9, 2), 5000.0), time_s, track_m)

@@ -325,6 +325,14 @@ class TestPose:
         assert found.records[0].fix.sigma_horizontal_m == pytest.approx(0.4)
         assert found.records[0].fix.sigma_vertical_m == pytest.approx(0.6)
 
+    def test_a_stream_that_repeats_a_slower_ones_fixes_is_not_the_better(self) -> None:
+        held = positions(hz=10.0)
+        rows = np.arange(1200) // 2 * 2
+        held = replace(held, stream="AHR2", latitude_deg=held.latitude_deg[rows], fused=False)
+        line = timeline(log(positions=(held, positions(hz=5.0, stream="GPS", fused=False))))
+        assert line.positions is not None
+        assert line.positions.stream == "GPS"
+
     def test_across_the_date_line(self) -> None:
         time_s = np.arange(0.0, 120.0, 0.1)
         frame = LocalFrame(-17.0, 180.0, 0.0)

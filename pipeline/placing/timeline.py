@@ -25,7 +25,8 @@ from pipeline.tracks.mount import Mount
 FRD_FROM_FLU: Floats = np.diag([1.0, -1.0, -1.0])
 # Parents of poses whose axes are east, north, up by convention (REP 105 for "map").
 _EARTH_FRAMES = frozenset({"enu", "map", "earth", "world_enu"})
-
+# A tenth of a millimetre: less than any log's last digit.
+_LEAST_STEP_DEG = 1e-9
 
 Stream = TypeVar("Stream", Positions, Attitudes, LocalPoses)
 
@@ -37,7 +38,7 @@ class Timeline:
     Args:
         log: What was read.
         clock: From the log's clock to UTC; None when nothing ties it.
-        positions: The best stream of positions on earth, or None.
+        positions: The best stream of positions on earth: a filter's before a receiver's; or None.
         vehicle: The best stream of the vehicle's attitude, or None.
         gimbal: The best stream of the camera's attitude by its gimbal, or None.
         local: The stream of poses in a local frame, or None.
@@ -78,7 +79,7 @@ def timeline(log: FlightLog, pose_topic: str | None = None, camera_frame: str | 
         The timeline.
     """
     frame = camera_frame or _camera_frame(log)
-    positions = _longest([p for p in log.positions if p.fused]) or _longest(log.positions)
+    positions = _liveliest([p for p in log.positions if p.fused]) or _liveliest(log.positions)
     vehicle = _longest([a for a in log.attitudes if a.of == "vehicle"])
     gimbal = _best_gimbal(log)
     carried = _longest([p for p in log.poses if frame and p.child == frame and p.parent])
@@ -137,6 +138,20 @@ def _longest(streams: Iterable[Stream]) -> Stream | None:
     """The stream of most samples; of equals the first by name."""
     listed = [stream for stream in streams if len(stream.time_ns)]
     return min(listed, key=lambda stream: (-len(stream.time_ns), stream.stream)) if listed else None
+
+
+def _liveliest(streams: Iterable[Positions]) -> Positions | None:
+    """The stream whose position changes most often: a stream that repeats a slower one's fixes holds steps, not more.
+
+    Where nothing tells them apart (a hover, named images) it is that of most samples.
+    """
+    listed = [stream for stream in streams if len(stream.time_ns)]
+    return min(listed, key=lambda p: (-_moves(p), -len(p.time_ns), p.stream)) if listed else None
+
+
+def _moves(positions: Positions) -> int:
+    steps_deg = np.maximum(np.abs(np.diff(positions.latitude_deg)), np.abs(np.diff(positions.longitude_deg)))
+    return int(np.count_nonzero(steps_deg > _LEAST_STEP_DEG))
 
 
 def _best_gimbal(log: FlightLog) -> Attitudes | None:

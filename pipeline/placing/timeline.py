@@ -27,6 +27,7 @@ FRD_FROM_FLU: Floats = np.diag([1.0, -1.0, -1.0])
 _EARTH_FRAMES = frozenset({"enu", "map", "earth", "world_enu"})
 # A tenth of a millimetre: less than any log's last digit.
 _LEAST_STEP_DEG = 1e-9
+_ALIKE = 0.8
 
 Stream = TypeVar("Stream", Positions, Attitudes, LocalPoses)
 
@@ -141,12 +142,15 @@ def _longest(streams: Iterable[Stream]) -> Stream | None:
 
 
 def _liveliest(streams: Iterable[Positions]) -> Positions | None:
-    """The stream whose position changes most often: a stream that repeats a slower one's fixes holds steps, not more.
+    """The stream whose position changes most often; of near equals the one that repeats itself least.
 
-    Where nothing tells them apart (a hover, named images) it is that of most samples.
+    A stream that repeats a slower one's fixes holds steps, not more. Where nothing tells (a hover, named images) it is
+    that of most samples.
     """
-    listed = [stream for stream in streams if len(stream.time_ns)]
-    return min(listed, key=lambda p: (-_moves(p), -len(p.time_ns), p.stream)) if listed else None
+    listed = [(stream, _moves(stream)) for stream in streams if len(stream.time_ns)]
+    most = max((moves for _, moves in listed), default=0)
+    lively = [(stream, moves / len(stream.time_ns)) for stream, moves in listed if moves >= _ALIKE * most]
+    return min(lively, key=lambda p: (-p[1], -len(p[0].time_ns), p[0].stream))[0] if lively else None
 
 
 def _moves(positions: Positions) -> int:

@@ -13,14 +13,14 @@ from pipeline.engine.errors import EpiTransferError
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.geodesy.heights import height_datum
 from pipeline.placing import steps
-from pipeline.placing.gather import files_of, find_logs
+from pipeline.placing.locate import files_of, find_logs, find_videos, named
 from pipeline.placing.tables import clock_row, track_pieces
 from pipeline.placing.telling import record_facts, summary, warn_of
 from pipeline.sources.accuracy import local_sigmas
 from pipeline.sources.datums import AUTO
-from pipeline.sources.files import MARK_SUFFIXES, beside, common_root, find, find_images, is_url
+from pipeline.sources.files import MARK_SUFFIXES, beside, common_root, find_images, is_url
 from pipeline.sources.frames import assemble
-from pipeline.sources.video import VIDEO_SUFFIXES, srt_beside
+from pipeline.sources.video import srt_beside
 from stages.mount_config import MountConfig
 
 _Paths = str | tuple[str, ...] | None
@@ -105,7 +105,8 @@ def run(config: Config, context: Context) -> str:
     """Reads everything and writes the tables; an image that cannot be used is a row with its reason."""
     wishes = _wishes(config)
     root, photos = photo_root(config), _photos(config)
-    sources = steps.read_sources(context, find_logs(config.logs), find_logs(config.bags), _videos(config), wishes)
+    sure = named(config.logs) | named(config.bags)
+    sources = steps.read_sources(context, find_logs(config.logs), find_logs(config.bags), _videos(config), wishes, sure)
     images = steps.extract(context, sources, wishes)
     records = steps.read_photos(context, photos, images, sources, wishes)
     placed = steps.placed(records, images, sources, wishes)
@@ -168,7 +169,7 @@ def _photos(config: Config) -> list[str]:
 
 
 def _videos(config: Config) -> list[str]:
-    return sorted({video for name in _listed(config.videos) for video in find(name, VIDEO_SUFFIXES)})
+    return find_videos(_listed(config.videos))
 
 
 def _listed(names: _Paths) -> Sequence[str]:

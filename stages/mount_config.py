@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pipeline.tracks.mount import Mount
+
+_MOST_DEG, _LONGEST_ARM_M = 360.0, 20.0
 
 
 class MountConfig(BaseModel):
@@ -20,6 +22,20 @@ class MountConfig(BaseModel):
         default=(0.0, 0.0, 0.0),
         description="From the antenna, or what is posed, to the sensor: forward, right, down (m)",
     )
+
+    @field_validator("yaw_deg", "pitch_deg", "roll_deg")
+    @classmethod
+    def _angle(cls, value: float | None) -> float | None:
+        if value is not None and abs(value) > _MOST_DEG:
+            raise ValueError(f"an angle between -{_MOST_DEG:g} and {_MOST_DEG:g} degrees")
+        return value
+
+    @field_validator("lever_arm_m")
+    @classmethod
+    def _arm(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if max(map(abs, value)) > _LONGEST_ARM_M:
+            raise ValueError(f"metres on the vehicle, at most {_LONGEST_ARM_M:g}")
+        return value
 
     def mount(self) -> Mount:
         """As geometry; angles that are not stated are none where none is, and 0 beside others."""

@@ -53,6 +53,14 @@ def command(
 
 def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None) -> tuple[str, Sections]:
     if workflow is not None:
+        if workflow.suffix.lower() != ".toml":
+            raise UsageError(
+                "E-RUN-12",
+                "this is no workflow file",
+                found=str(workflow),
+                expected="a file whose name ends in .toml",
+                hint="sources go by option: --photos DIR --logs FILE --logs FILE",
+            )
         if clash := [name for name, value in {**ingest, "lidar": lidar}.items() if value]:
             raise UsageError(
                 "E-RUN-08",

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from pipeline.engine.config import Sections, absolute_paths, load_workflow, parse_overrides, resolve
+from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
 from stages.options import Jobs, Scheduler, Set
@@ -35,6 +36,14 @@ def ingest(
     layers: list[tuple[str, Sections]] = []
     if workflow is not None:
         layers.append((workflow.name, load_workflow(workflow, MODELS)))
+    elif logs and not (photos or bags or videos or folder.workflow.exists()):
+        raise UsageError(
+            "E-RUN-09",
+            "nothing to run",
+            found="a log alone",
+            expected="--photos DIR, --bags FILE or --videos FILE beside it",
+            hint="epitransfer ingest --help",
+        )
     elif not (photos or bags or videos) or folder.workflow.exists():
         layers.append(("run folder", kept_sections(folder)))
     else:

@@ -141,5 +141,7 @@ def _check_failures(records: Mapping[str, Any], configuration: Configuration) ->
                 f"{name}: too many items failed; the run is finished all the same",
                 found=f"{failed} of {total}",
                 expected=f"at most {allowed:.0%}",
-                hint=f"the reasons are in the tables; --set {name}.max_failed_share=1 accepts them",
+                hint="nothing is left to go on with; the warnings above and the tables say why"
+                if failed == total
+                else f"the reasons are in the tables; --set {name}.max_failed_share=1 accepts them",
             )

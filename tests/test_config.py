@@ -1,3 +1,4 @@
+import re
 import tomllib
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from pydantic import Field
 from pipeline.engine.config import load_workflow, parse_overrides, resolve, to_toml
 from pipeline.engine.errors import InputError, UsageError
 from pipeline.engine.stage import StageConfig
+from stages.registry import MODELS as STAGE_MODELS
 
 
 class First(StageConfig):
@@ -94,3 +96,32 @@ def test_malformed_override_is_a_usage_error(item: str) -> None:
 def test_toml_round_trip(text: str, number: float, flag: bool, listed: list[str]) -> None:
     section = {"text": text, "number": number, "flag": flag, "listed": listed}
     assert tomllib.loads(to_toml({"second": section}))["second"] == section
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("ingest.mount={pich_deg=-90}", "did you mean pitch_deg?"),
+        ("ingest.mount.pich_deg=-90", "did you mean pitch_deg?"),
+        ("ingest.mount={lever_arm_m=[0.1, 0.2]}", "lever_arm_m: more numbers"),
+        ("ingest.mount=down", "a table: { yaw_deg"),
+        ("ingest.mount.pitch_deg=-9000", "pitch_deg: an angle between"),
+        ("ingest.mount.lever_arm_m=[0, 0, 100]", "lever_arm_m: metres on the vehicle"),
+        ("photos.x=1", "put it under [ingest]"),
+    ],
+)
+def test_tables_within_a_section_are_explained(text: str, told: str) -> None:
+    def resolved() -> None:
+        layers = [("w.toml", {"ingest": {"photos": "p"}}), ("command line", parse_overrides([text], STAGE_MODELS))]
+        resolve(layers, STAGE_MODELS)
+
+    with pytest.raises(UsageError, match=re.escape(told)):
+        resolved()
+
+
+def test_entries_of_a_table_add_up() -> None:
+    layers = [("w.toml", {"ingest": {"photos": "p", "mount": {"lever_arm_m": [1.0, 2.0, 3.0], "yaw_deg": 5.0}}})]
+    overrides = ["ingest.mount.pitch_deg=-90", "ingest.mount.yaw_deg=0"]
+    layers.append(("command line", parse_overrides(overrides, STAGE_MODELS)))
+    mount = resolve(layers, STAGE_MODELS).value("ingest.mount")
+    assert (mount.lever_arm_m, mount.yaw_deg, mount.pitch_deg) == ((1.0, 2.0, 3.0), 0.0, -90.0)

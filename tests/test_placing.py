@@ -19,7 +19,7 @@ from pipeline.geometry.rotations import (
     ned_from_frd,
     quaternion_from_rotation,
 )
-from pipeline.placing.clock import photo_times
+from pipeline.placing.photo_clock import photo_times
 from pipeline.placing.place import Placed, Stamp, place
 from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import FRD_FROM_FLU, Timeline, timeline
@@ -165,6 +165,28 @@ class TestClock:
         events = Events("CAM", ns(20.123 + 2.0 * np.arange(20)), np.arange(20), feedback=True, sigma_s=0.001)
         found = placed(photos(time_s, 37.0), log(events=(events,)), clock_offset_s=37.3)
         assert enu(found.records[0]) == pytest.approx(along(time_s[:1])[0], abs=1e-4)
+
+    def test_a_statement_that_the_intervals_contradict_is_refused(self) -> None:
+        for stated in (3637.0, 39.0, -37.0):
+            with pytest.raises(UndeterminedError, match=r"clock_offset_s says .* say \+37\.00 s"):
+                placed(photos(shots(), 37.0), log(), clock_offset_s=stated)
+        found = placed(photos(shots(), 37.0), log(), clock_offset_s=37.0)
+        assert {record.time_source for record in found.records} == {"log event"}
+
+    def test_the_log_of_another_day_is_not_taken_for_a_clock_days_off(self) -> None:
+        rng = np.random.default_rng(8)
+        strange = Events("CAM", ns(np.cumsum(rng.uniform(1.0, 6.0, 30))), np.arange(30), feedback=True, sigma_s=0.001)
+        with pytest.raises(UndeterminedError) as error:
+            placed(photos(shots(), 40 * 86_400.0), log(events=(strange,)))
+        assert "--set" not in error.value.hint
+        # A clock that was never set is believed where all photos fit.
+        found = placed(photos(shots(), 3000 * 86_400.0), log())
+        assert {record.time_source for record in found.records} == {"log event"}
+
+    def test_photos_of_another_place_are_not_moved_to_the_log(self) -> None:
+        elsewhere = photos(shots(), 37.0, position=Position(48.0, 11.0, "exif position"))
+        with pytest.raises(UndeterminedError, match="km from where the log was then"):
+            placed(elsewhere, log())
 
     def test_photos_that_know_where_they_were(self) -> None:
         time_s = shots()
@@ -399,6 +421,16 @@ class TestLocalFrames:
             pytest.approx((0.4, 0.0, 0.5)),
         ]
         assert {record.time_source for record in found.records} == {"log stamp"}
+
+    def test_an_image_that_a_model_does_not_name_is_a_row(self) -> None:
+        poses = LocalPoses(
+            "model", np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]), "world", "", "camera",
+            "rdf", ("DJI_0001.JPG",), np.zeros(1, np.int64),
+        )  # fmt: skip
+        found = placed(photos(np.array([1.0, 2.0])), log(positions=(), attitudes=(), events=(), poses=(poses,)))
+        assert [bool(record.problem) for record in found.records] == [False, True]
+        assert "does not name it" in found.records[1].problem
+        assert found.idle == ()
 
     def test_poses_of_named_images(self) -> None:
         rotation = (

@@ -12,9 +12,9 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipeline.engine.errors import InputError, UsageError
@@ -110,12 +110,16 @@ def parse_overrides(items: Iterable[str], models: Models) -> Sections:
     for item in items:
         key, separator, text = item.partition("=")
         section, dot, name = key.strip().partition(".")
-        if not (separator and dot and name):
+        name, inner, part = name.partition(".")
+        if not (separator and dot and name) or (inner and not part):
             raise UsageError(
                 "E-CONFIG-04", "--set needs section.key=value", found=item, hint="--set depth.max_range_m=80"
             )
         _check_section(section, models, f"--set {item}")
-        sections.setdefault(section, {})[name] = _toml_value(text.strip())
+        value = _toml_value(text.strip())
+        keys = sections.setdefault(section, {})
+        # ingest.mount.pitch_deg=-90 is one entry of the table ingest.mount.
+        keys[name] = {**_table(keys.get(name)), part: value} if inner else value
     return absolute_paths(sections, models, Path.cwd())
 
 
@@ -135,7 +139,8 @@ def resolve(layers: Iterable[tuple[str, Sections]], models: Models) -> Configura
         for name, section in sections.items():
             given.setdefault(name, {})
             for key, value in section.items():
-                given[name][key] = value
+                both_tables = isinstance(value, Mapping) and isinstance(given[name].get(key), Mapping)
+                given[name][key] = {**given[name][key], **value} if both_tables else value
                 origins[f"{name}.{key}"] = origin
     resolved: dict[str, StageConfig] = {}
     for name, model in models.items():
@@ -145,7 +150,7 @@ def resolve(layers: Iterable[tuple[str, Sections]], models: Models) -> Configura
         try:
             resolved[name] = model.model_validate(given[name])
         except ValidationError as error:
-            raise _explained(name, error, origins) from error
+            raise _explained(name, model, error, origins) from error
         for key in model.model_fields:
             origins.setdefault(f"{name}.{key}", "default")
     return Configuration(resolved, origins, given)
@@ -203,7 +208,7 @@ def _check_section(name: str, models: Models, where: str) -> None:
             f"unknown section [{name}]",
             where=where,
             expected=", ".join(models),
-            hint=_nearest(name, models) or "remove it",
+            hint=_home(name, models) or _nearest(name, models) or "remove it",
         )
 
 
@@ -219,15 +224,31 @@ def _check_keys(name: str, section: Mapping[str, Any], model: type[StageConfig],
             )
 
 
+def _home(name: str, models: Models) -> str:
+    """Where a key belongs that stands where a section should."""
+    homes = [section for section, model in models.items() if name in model.model_fields]
+    return f"put it under [{homes[0]}] ({homes[0]}.{name})" if homes else ""
+
+
 def _nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.4)
     return f"did you mean {close[0]}?" if close else ""
 
 
-def _explained(name: str, error: ValidationError, origins: Mapping[str, str]) -> UsageError:
+def _explained(name: str, model: type[StageConfig], error: ValidationError, origins: Mapping[str, str]) -> UsageError:
     first = error.errors()[0]
     key = ".".join(str(part) for part in (name, *first["loc"][:1]))
-    if first["type"] == "missing":
+    if first["type"] == "extra_forbidden" and len(first["loc"]) > 1:
+        known = _keys_within(model.model_fields[str(first["loc"][0])])
+        wrong = str(first["loc"][-1])
+        return UsageError(
+            "E-CONFIG-06",
+            f"unknown key {key}.{wrong}",
+            where=origins.get(key, "workflow"),
+            expected=", ".join(known),
+            hint=_nearest(wrong, known) or "remove it",
+        )
+    if first["type"] == "missing" and len(first["loc"]) == 1:
         return UsageError(
             "E-CONFIG-08",
             f"{key} has no value",
@@ -247,5 +268,27 @@ def _explained(name: str, error: ValidationError, origins: Mapping[str, str]) ->
         f"{key} has a value that is not allowed",
         where=origins.get(key, "workflow"),
         found=repr(first.get("input")),
-        expected=str(first["msg"]),
+        expected=_wanted(first["type"], str(first["msg"]), model, first["loc"]),
     )
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _keys_within(field: FieldInfo) -> list[str]:
+    """The keys of a table-valued key, whatever else its type allows."""
+    for kind in (field.annotation, *get_args(field.annotation)):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return list(kind.model_fields)
+    return []
+
+
+def _wanted(kind: str, message: str, model: type[StageConfig], where: tuple[int | str, ...]) -> str:
+    """What a value should be, in the workflow's words."""
+    inside = _keys_within(model.model_fields[str(where[0])])
+    if kind == "model_type":
+        return f"a table: {{ {', '.join(f'{key} = ...' for key in inside)} }}"
+    told = "more numbers in the list" if kind == "missing" else message.removeprefix("Value error, ")
+    named = [str(part) for part in where[1:] if str(part) in inside]
+    return f"{named[0]}: {told}" if named else told

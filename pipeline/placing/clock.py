@@ -1,133 +1,34 @@
 """A camera's clock against a log's: by trigger events, by places, by what the user or the files say, in that order.
 
-Order alone never decides which photo is which exposure: one lost frame would shift all that follow.
+Order alone never decides which photo is which exposure: one lost frame would shift all that follow. What one of them
+decides must not contradict the others: neither a stated offset nor the places of the photos.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
-
 import numpy as np
 
 from pipeline.clocks.fit import ClockFit, Nanoseconds
-from pipeline.clocks.intervals import Alignment, Alignments, align, doubts
-from pipeline.clocks.offsets import COARSE_TICK_S, FEWEST_MATCHES
+from pipeline.clocks.offsets import FEWEST_MATCHES
 from pipeline.clocks.places import offset_by_place
 from pipeline.geometry.arrays import Floats, Ints
-from pipeline.placing.pose import level_track
+from pipeline.placing.by_events import by_events
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, Refusal, log_ns_of
+from pipeline.placing.pose import LONGEST_POSITION_GAP_S, level_track
 from pipeline.placing.timeline import Timeline
-from pipeline.sources.photos import PhotoRecord
-from pipeline.sources.records import Events
+from pipeline.sources.records import Positions
+from pipeline.tracks.series import between, bracket
 
 # Photo clocks that say UTC themselves are this near it, and users state offsets to a good half second.
 _TRUSTED_SIGMA_S = 2.0
 _STATED_SIGMA_S = 0.4
-# Which time tags say UTC: the others are a local time whose zone nobody wrote down.
-TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone"})
-_BY_SATELLITE = frozenset({"utc_at_exposure", "gps"})
-_LEAST_SHARE = 0.5
+# A stated offset that the log contradicts by more was meant otherwise; whole seconds are usual.
+_STATED_SLACK_S = 1.5
+# Position tags lag by seconds; what is further off than that is another place.
+_ELSEWHERE_M = 500.0
 _HEADER_SIGMA_S = 0.001
+_BY_SATELLITE = frozenset({"utc_at_exposure", "gps"})
 _QUARTER_S = 900
-_FINEST_TICK_S = 1e-6
-_DIGITS = re.compile(r"(\d+)")
-
-
-@dataclass(frozen=True, slots=True)
-class PhotoTimes:
-    """The photos of one camera, in order of time.
-
-    Args:
-        records: The photos.
-        time_ns: (n,) on the camera's clock, read as UTC.
-        tick_s: Resolution of that clock.
-        trusted: Whether the clock says UTC itself.
-        of_log: Whether they came out of a log or video, and have its clock.
-    """
-
-    records: tuple[PhotoRecord, ...]
-    time_ns: Nanoseconds
-    tick_s: float
-    trusted: bool
-    of_log: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class ClockMatch:
-    """Exposures of photos on a log's clock.
-
-    Args:
-        log_ns: (n,) instants on the log's own clock.
-        sigma_s: (n,) one sigma of them.
-        event: (n,) index of the photo's event, -1 without one.
-        reason: Per photo, why it has no instant; empty where it has one.
-        method: How, for people.
-        offset_s: Log's time (UTC, or boot where it says no UTC) minus the camera's.
-        drift: Seconds the offset grows per second.
-        offset_sigma_s: One sigma of the offset.
-        residual_s: Root mean square of the anchors; None where the method has none.
-        anchors: Events or photos used.
-        events: The events used; None when none were.
-        note: What to distrust.
-    """
-
-    log_ns: Nanoseconds
-    sigma_s: Floats
-    event: Ints
-    reason: tuple[str, ...]
-    method: str
-    offset_s: float
-    drift: float
-    offset_sigma_s: float
-    residual_s: float | None
-    anchors: int
-    events: Events | None = None
-    note: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """Why a log's clock and the camera's could not be brought together, with the remedy."""
-
-    reasons: tuple[str, ...] = field(default_factory=tuple)
-
-    def __str__(self) -> str:
-        return "; ".join(self.reasons)
-
-
-def photo_times(records: Sequence[PhotoRecord]) -> PhotoTimes:
-    """The photos of one camera by time, then name: cameras number what they take in one second in order."""
-    timed = sorted((r for r in records if r.time is not None), key=_by_time)
-    times = np.array([_ns(r.time) for r in timed if r.time is not None], np.int64)
-    return PhotoTimes(tuple(timed), times, _tick_s(times), all(r.time_source in TRUSTED for r in timed))
-
-
-def image_times(records: Sequence[PhotoRecord], line: Timeline, log_ns: Sequence[int]) -> PhotoTimes:
-    """Images that came out of a log or video, on its clock.
-
-    Args:
-        records: The images.
-        line: What they came out of.
-        log_ns: Their instants on its own clock.
-
-    Returns:
-        The images by time: UTC where something ties that clock to it, else since the log or video began.
-    """
-    order = sorted(range(len(records)), key=lambda k: (log_ns[k], by_number(records[k].frame_id)))
-    time_ns = line.utc_ns(np.array([log_ns[k] for k in order], np.int64))
-    # Such instants are exact: that they lie on whole seconds or frames says nothing of the clock's resolution.
-    return PhotoTimes(tuple(records[k] for k in order), time_ns, _FINEST_TICK_S, line.clock is not None, of_log=True)
-
-
-def by_number(name: str) -> list[tuple[int, str]]:
-    """A name as a key that puts IMG_9 before IMG_10."""
-    return [(int(part or -1), "") if k % 2 else (0, part) for k, part in enumerate(_DIGITS.split(name))]
-
-
-def _by_time(record: PhotoRecord) -> tuple[int, list[tuple[int, str]]]:
-    return (0 if record.time is None else _ns(record.time)), by_number(record.frame_id)
 
 
 def match_clock(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> ClockMatch | Refusal:
@@ -142,10 +43,14 @@ def match_clock(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> C
         The instants, or why there are none.
     """
     refusals: list[str] = []
+    # What else says the offset is asked only where the intervals alone leave it open.
+    prior = _prior(photos, line, stated_s)
     for events in line.events:
-        found = _by_events(photos, line, events, stated_s)
+        found = by_events(photos, line, events, None)
+        if isinstance(found, Refusal) and prior is not None:
+            found = by_events(photos, line, events, prior)
         if isinstance(found, ClockMatch):
-            return found
+            return _unless_contradicted(photos, line, found, stated_s)
         refusals += found.reasons
     if stated_s is None:
         by_place = _by_places(photos, line)
@@ -153,85 +58,49 @@ def match_clock(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> C
             return by_place
         refusals += by_place.reasons
     by_clock = _as_said(photos, line, stated_s)
-    return by_clock if isinstance(by_clock, ClockMatch) else Refusal((*refusals, *by_clock.reasons))
+    if isinstance(by_clock, ClockMatch):
+        return _unless_contradicted(photos, line, by_clock, stated_s)
+    return Refusal((*refusals, *by_clock.reasons))
 
 
-def _by_events(photos: PhotoTimes, line: Timeline, events: Events, stated_s: float | None) -> ClockMatch | Refusal:
-    """By the intervals between triggers."""
-    if min(len(photos.records), len(events.time_ns)) < FEWEST_MATCHES:
-        return Refusal(
-            (f"{len(events.time_ns)} events of {events.stream} and {len(photos.records)} photos are too few",)
+def _unless_contradicted(
+    photos: PhotoTimes, line: Timeline, match: ClockMatch, stated_s: float | None
+) -> ClockMatch | Refusal:
+    """A match, unless the user or the photos' own positions say otherwise: somebody is wrong, and who is not known."""
+    slack_s = _STATED_SLACK_S + photos.tick_s
+    if stated_s is not None and line.clock is not None and abs(match.offset_s - stated_s) > slack_s:
+        told = (
+            f"ingest.clock_offset_s says {stated_s:+g} s, the {match.method} say {match.offset_s:+.2f} s: leave it out "
+            f"(or --set ingest.clock_offset_s={match.offset_s:.1f}) if they are right"
         )
-    shared_ns = line.utc_ns(events.time_ns)
-    base_photo, base_event = int(photos.time_ns[0]), int(shared_ns[0])
-    photo_s, event_s = (photos.time_ns - base_photo) / 1e9, (shared_ns - base_event) / 1e9
-    between_s = (base_event - base_photo) / 1e9
-    prior = _prior(photos, line, stated_s)
-    found = align(photo_s, event_s, photos.tick_s, None if prior is None else (prior[0] - between_s, prior[1]))
-    best = found.best
-    if best is None:
-        return Refusal((f"no offset brings three photos to events of {events.stream}",))
-    if found.rival is not None:
-        told = _undecided(events, best, found.rival, between_s, len(photos.records))
-        # An offset to UTC says nothing of a clock that counts from the start of the machine.
-        cure = f" (say which: --set ingest.clock_offset_s={best.offset_s + between_s:.1f})" if line.clock else ""
-        return Refusal((f"{told}{cure}",))
-    predicted_s = photo_s * (1.0 + best.drift) + best.offset_s + photos.tick_s / 2.0
-    inside = np.count_nonzero((predicted_s > event_s[0] - 1.0) & (predicted_s < event_s[-1] + 1.0))
-    if best.matched < max(FEWEST_MATCHES, _LEAST_SHARE * inside):
-        return Refusal((f"at best {best.matched} of {len(photos.records)} photos have an event of {events.stream}",))
-    return _matched(photos, line, events, found, best, photo_s, event_s, between_s)
+        return Refusal((told,))
+    apart_m = _apart_m(photos, line, match)
+    if apart_m > _ELSEWHERE_M:
+        apart = f"{apart_m / 1000.0:.0f} km" if apart_m > 10_000.0 else f"{apart_m:.0f} m"
+        return Refusal((f"the photos' own positions are {apart} from where the log was then: another flight's log?",))
+    return match
 
 
-def _matched(
-    photos: PhotoTimes,
-    line: Timeline,
-    events: Events,
-    found: Alignments,
-    best: Alignment,
-    photo_s: Floats,
-    event_s: Floats,
-    between_s: float,
-) -> ClockMatch:
-    """Photos with an event take its instant; the others the clock's."""
-    base_ns = int(line.utc_ns(events.time_ns)[0])
-    has = best.event >= 0
-    predicted_s = photo_s * (1.0 + best.drift) + best.offset_s + photos.tick_s / 2.0
-    shared_ns = base_ns + np.rint(predicted_s * 1e9).astype(np.int64)
-    log_ns = np.where(has, events.time_ns[np.maximum(best.event, 0)], _log_ns(line, shared_ns))
-    offset_sigma_s = _offset_sigma_s(best, photos.tick_s)
-    within_tick_s = photos.tick_s / np.sqrt(12.0) if photos.tick_s >= COARSE_TICK_S else best.sigma_s
-    fit_sigma_s = float(np.hypot(offset_sigma_s, within_tick_s))
-    sigma_s = np.where(has, events.sigma_s, fit_sigma_s)
-    reasons = [""] * len(has)
-    others_of = doubts(photo_s, event_s, photos.tick_s, found, offset_sigma_s)
-    for photo in np.flatnonzero(has).tolist():
-        others = others_of[photo]
-        apart = np.abs(event_s[others] - event_s[best.event[photo]])
-        if len(others) and float(apart.max()) > 3.0 * events.sigma_s + 0.01:
-            reasons[photo] = (
-                f"{1 + len(others)} triggers fit its time, {float(apart.max()):.2f} s apart: the camera's clock tells "
-                f"{photos.tick_s:g} s only"
-            )
-    return ClockMatch(
-        log_ns, sigma_s, best.event, tuple(reasons),
-        f"intervals of {best.matched} of {len(event_s)} {'exposures' if events.feedback else 'triggers'} "
-        f"({events.stream})",
-        best.offset_s + between_s, best.drift, offset_sigma_s, best.rms_s, best.matched,
-        events, "" if events.feedback else f"triggers, not exposures: the shutter's lag is unknown ({events.stream})",
-    )  # fmt: skip
+def _apart_m(photos: PhotoTimes, line: Timeline, match: ClockMatch) -> float:
+    """Median level distance of photos from where the log puts their instants; 0 where either has no positions."""
+    if line.positions is None:
+        return 0.0
+    tagged, track_m, photo_m = _places(photos, line.positions)
+    where = bracket(line.positions.time_ns, line.positions.segment, match.log_ns[tagged], LONGEST_POSITION_GAP_S)
+    apart_m = np.linalg.norm(between(track_m, where)[:, :2] - photo_m[:, :2], axis=1)
+    known = apart_m[np.isfinite(apart_m)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
-def _offset_sigma_s(best: Alignment, tick_s: float) -> float:
-    """How well the events tell the offset; within a coarse tick, what the spread of the residuals leaves open.
-
-    Exposures on the beat of a coarse clock all show the same fraction of it: no number of them tells which.
-    """
-    known = best.residual_s[np.isfinite(best.residual_s)]
-    averaged_s = best.sigma_s / np.sqrt(len(known))
-    if tick_s < COARSE_TICK_S:
-        return float(averaged_s)
-    return float(max(tick_s - np.ptp(known), averaged_s) / np.sqrt(12.0))
+def _places(photos: PhotoTimes, positions: Positions) -> tuple[Ints, Floats, Floats]:
+    """Which photos have positions, the track (n, 3) and those positions (k, 3), in one frame, m."""
+    tagged = np.array([k for k, record in enumerate(photos.records) if record.position is not None], np.int64)
+    places = [photos.records[k].position for k in tagged]
+    frame, track_m = level_track(positions)
+    latitude, longitude = (
+        np.array([getattr(place, name) for place in places], np.float64) for name in ("latitude_deg", "longitude_deg")
+    )
+    return tagged, track_m, frame.enu_from_geodetic(latitude, longitude, np.full(len(tagged), frame.height_m))
 
 
 def _prior(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> tuple[float, float] | None:
@@ -243,22 +112,13 @@ def _prior(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> tuple[
     return (0.0, float(np.hypot(_TRUSTED_SIGMA_S, line.clock.sigma_s))) if photos.trusted else None
 
 
-def _undecided(events: Events, best: Alignment, rival: Alignment, between_s: float, photos: int) -> str:
-    return (
-        f"the intervals of {events.stream} do not decide: an offset of {best.offset_s + between_s:+.2f} s fits "
-        f"{best.matched} of {photos} photos, {rival.offset_s + between_s:+.2f} s fits {rival.matched}"
-    )
-
-
 def _by_places(photos: PhotoTimes, line: Timeline) -> ClockMatch | Refusal:
     """By where the photos say they were."""
-    tagged = [k for k, record in enumerate(photos.records) if record.position is not None]
-    if line.positions is None or len(tagged) < FEWEST_MATCHES:
-        return Refusal(("the photos hold no positions to find the time by",) if line.positions is not None else ())
-    frame, track_m = level_track(line.positions)
-    places = [photos.records[k].position for k in tagged]
-    latitude, longitude = (np.array([getattr(p, name) for p in places]) for name in ("latitude_deg", "longitude_deg"))
-    photo_m = frame.enu_from_geodetic(latitude, longitude, np.full(len(tagged), frame.height_m))
+    if line.positions is None:
+        return Refusal(())
+    tagged, track_m, photo_m = _places(photos, line.positions)
+    if len(tagged) < FEWEST_MATCHES:
+        return Refusal(("the photos hold no positions to find the time by",))
     shared_ns = line.utc_ns(line.positions.time_ns)
     base_photo, base_log = int(photos.time_ns[0]), int(shared_ns[0])
     photo_s = (photos.time_ns - base_photo) / 1e9 + photos.tick_s / 2.0
@@ -295,7 +155,8 @@ def _as_said(photos: PhotoTimes, line: Timeline, stated_s: float | None) -> Cloc
         return Refusal((no_overlap_hint(photos.time_ns, int(shared_ns[0]), int(shared_ns[-1]), what),))
     sigma_s = _said_sigma_s(photos, line.clock, stated_s, header=header)
     method = "stated by the user" if stated_s is not None else f"said by the files ({photos.records[0].time_source})"
-    note = "" if header else "nothing checks this offset: no camera events, no positions"
+    unchecked = "the log's camera events do not confirm this offset" if line.events else "nothing checks this offset"
+    note = "" if header else unchecked
     return _by_offset(photos, line, at_ns, sigma_s, method, offset_s, 0, note)
 
 
@@ -331,7 +192,7 @@ def _by_offset(
 ) -> ClockMatch:
     n = len(photos.records)
     return ClockMatch(
-        _log_ns(line, shared_ns), np.full(n, sigma_s), np.full(n, -1, np.int64), ("",) * n,
+        log_ns_of(line, shared_ns), np.full(n, sigma_s), np.full(n, -1, np.int64), ("",) * n,
         method, offset_s, 0.0, sigma_s, None, anchors, None, note,
     )  # fmt: skip
 
@@ -359,25 +220,3 @@ def no_overlap_hint(time_ns: Nanoseconds, first_ns: int, last_ns: int, what: str
         f"an offset of {int(quarters[best])} s would put {inside[best]} of {len(time_ns)} {what} inside the "
         f"log: --set ingest.clock_offset_s={int(quarters[best])}"
     )
-
-
-def _log_ns(line: Timeline, shared_ns: Nanoseconds) -> Nanoseconds:
-    """From the time photos and log share back to the log's own clock."""
-    if line.clock is None:
-        return shared_ns
-    guess = shared_ns - line.clock.offset_ns
-    # The drift is parts per million: one step is exact to a nanosecond.
-    return guess - (line.clock.apply(guess) - shared_ns)
-
-
-def _ns(time: datetime) -> int:
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
-
-
-def _tick_s(time_ns: Nanoseconds) -> float:
-    """The resolution of times: the coarsest decimal step that all of them lie on."""
-    for tick_ns in (1_000_000_000, 100_000_000, 10_000_000, 1_000_000):
-        if np.all(time_ns % tick_ns == 0):
-            return tick_ns / 1e9
-    return _FINEST_TICK_S

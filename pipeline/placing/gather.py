@@ -17,9 +17,8 @@ from pipeline.placing.clock import no_overlap_hint
 from pipeline.placing.place import Stamp
 from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import Timeline
-from pipeline.sources.files import find, is_url, stem
+from pipeline.sources.files import is_url, stem
 from pipeline.sources.intrinsics import SourcedCamera
-from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES, is_log_folder
 from pipeline.sources.photos import PhotoRecord
 from pipeline.sources.records import FlightLog, ImageStream
 from pipeline.tracks.mount import Mount
@@ -45,47 +44,6 @@ class Extracted:
     camera: SourcedCamera | None
     note: str
     problem: str = ""
-
-
-def find_logs(names: str | Sequence[str] | None) -> list[str]:
-    """Logs and bags of a path, glob or list of these, sorted and each once.
-
-    A folder that is itself a log (a ROS 2 bag, a COLMAP model) stays one; any other is searched.
-
-    Args:
-        names: What the user names; None for nothing.
-
-    Returns:
-        Locations.
-
-    Raises:
-        InputError: A named path does not exist, or a folder holds no log.
-    """
-    listed = [] if names is None else [names] if isinstance(names, str) else list(names)
-    found: set[str] = set()
-    for name in listed:
-        if is_log_folder(name):
-            found.add(name)
-            continue
-        hits = find(name, (*LOG_SUFFIXES, *BAG_SUFFIXES))
-        if not hits:
-            raise InputError(
-                "E-LOG-02", "no log here", where=name, found="no file of a known kind",
-                expected=", ".join((*LOG_SUFFIXES, *BAG_SUFFIXES)),
-                hint="name the file itself if it has another ending",
-            )  # fmt: skip
-        found.update(hits)
-    return sorted(found)
-
-
-def files_of(locations: Sequence[str]) -> list[str]:
-    """The files whose bytes decide: those of a folder that is a log, or the log itself."""
-    out: list[str] = []
-    for location in locations:
-        folder = Path(location)
-        inside = not is_url(location) and folder.is_dir()
-        out += sorted(str(file) for file in folder.rglob("*") if file.is_file()) if inside else [location]
-    return out
 
 
 def image_stream(log: FlightLog, topic: str | None) -> ImageStream:

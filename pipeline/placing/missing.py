@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.placing.clock import ClockMatch, PhotoTimes
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes
 
 _NUMBER = re.compile(r"(\d{3,})(?=\D*$)")
 

@@ -14,9 +14,10 @@ from pipeline.clocks.fit import Nanoseconds
 from pipeline.engine.errors import UndeterminedError
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.rotations import gimbal_angles
-from pipeline.placing.clock import ClockMatch, PhotoTimes, image_times, match_clock, photo_times
+from pipeline.placing.clock import match_clock
 from pipeline.placing.missing import unclaimed
 from pipeline.placing.named import by_name
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, image_times, photo_times
 from pipeline.placing.pose import CameraPoses, camera_poses
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.accuracy import TimingSigmas
@@ -26,6 +27,7 @@ from pipeline.tracks.mount import Mount
 
 # Header stamps and presentation times are those of the poses' own clock.
 _STAMP_SIGMA_S = 0.001
+_UNPLACED = "not placed by the log"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,14 @@ class Placed:
         clocks: Rows of `clocks` for the cameras' clocks.
         notes: What to tell the user.
         missing: Exposures without a photo, for the manifest.
+        idle: Logs that placed no image.
     """
 
     records: tuple[PhotoRecord, ...]
     clocks: tuple[Mapping[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     missing: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    idle: tuple[str, ...] = ()
 
 
 def place(
@@ -81,7 +85,7 @@ def place(
         The photos, placed; one that no log places keeps its own pose, or its reason.
 
     Raises:
-        UndeterminedError: The logs place no photo of a camera, and nothing says where they were.
+        UndeterminedError: The logs place no photo of a camera, or name none.
     """
     work = _Work(lines, stamps, mount, clock_offset_s, y_up, {record.location: record for record in records})
     for number, line in enumerate(lines):
@@ -90,11 +94,13 @@ def place(
             work.by_stamp(number, line)
     for (clock, _), group in work.clocks_left().items():
         work.by_clock(clock, group)
+    work.unnamed()
     return Placed(
         tuple(work.by_location[record.location] for record in records),
         tuple(work.clocks),
         tuple(dict.fromkeys(work.notes)),
         work.missing,
+        tuple(line.log.location for line in lines if line.log.location not in work.used),
     )
 
 
@@ -111,11 +117,13 @@ class _Work:
     clocks: list[Mapping[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     missing: dict[str, list[str]] = field(default_factory=dict)
+    used: set[str] = field(default_factory=set)
 
     def by_name(self, line: Timeline) -> None:
         """Poses that belong to named images."""
         found = by_name(list(self.by_location.values()), line, self.mount, y_up=self.y_up)
         self.by_location.update({record.location: record for record in found})
+        self.used.update([line.log.location] if found else [])
 
     def by_stamp(self, number: int, line: Timeline) -> None:
         """Images that came out of this log: their instants are on its clock."""
@@ -149,12 +157,12 @@ class _Work:
         """Images of one clock, log by log, until each has its place.
 
         Raises:
-            UndeterminedError: No log places any photo of a camera, and not all of them know their own place.
+            UndeterminedError: No log places any photo of a camera: whoever names a log wants it used.
         """
         waiting, refused = list(group), []
         for line in self.lines:
             asking = [record for record in waiting if not self._came_from(record, line)]
-            if not line.places or not asking:
+            if not line.places or line.names_images or not asking:
                 continue
             photos = self._times(asking)
             match = match_clock(photos, line, self._stated_s(photos))
@@ -175,6 +183,13 @@ class _Work:
         reason = "; ".join(refused) if stamped and refused else "no log covers its time" if self.clocks else ""
         for record in waiting:
             self._unplaced(record, reason)
+
+    def unnamed(self) -> None:
+        """Photos left over that a log of named images does not name."""
+        named = [line.log.location for line in self.lines if line.names_images]
+        for record in list(self.by_location.values()):
+            if named and not record.time_source.startswith("log ") and not record.pose_problem.startswith(_UNPLACED):
+                self._unplaced(record, f"{named[0]} does not name it, or not it alone")
 
     def _times(self, records: Sequence[PhotoRecord]) -> PhotoTimes:
         """Times of images of one clock."""
@@ -218,16 +233,18 @@ class _Work:
                     self.by_location[record.location] = replace(placed, pose_problem=reason)
                     continue
                 self.by_location[record.location] = _with_time(placed, line, int(log_ns[k]), sources[k])
+                self.used.add(line.log.location)
             elif not reason:
                 placed = _with_attitude(_with_position(record, poses, k, float(sigma_s[k])), poses, k)
                 self.by_location[record.location] = _with_time(placed, line, int(log_ns[k]), sources[k])
+                self.used.add(line.log.location)
             elif not poses.outside[k]:
                 self._unplaced(record, reason)
 
     def _unplaced(self, record: PhotoRecord, reason: str) -> None:
         """A photo that no log places: its own pose stands, or its reason."""
         if record.pose_problem and reason:
-            self.by_location[record.location] = replace(record, pose_problem=f"not placed by the log: {reason}")
+            self.by_location[record.location] = replace(record, pose_problem=f"{_UNPLACED}: {reason}")
 
 
 def _with_time(record: PhotoRecord, line: Timeline, log_ns: int, source: str) -> PhotoRecord:
@@ -304,8 +321,10 @@ def _unmatched(
         if stream is not None and len(stream.time_ns):
             ends = line.utc_ns(stream.time_ns[[0, -1]]) / 1e9
             begin, end = (datetime.fromtimestamp(float(t), UTC) for t in ends)
-            clock = line.log.time_base.source or "UTC" if line.clock is not None else "since boot"
-            found.append(f"{line.log.location}, {begin:%Y-%m-%d %H:%M:%S} .. {end:%H:%M:%S} ({clock})")
+            span = f"{begin:%Y-%m-%d %H:%M:%S} .. {end:%H:%M:%S} ({line.log.time_base.source or 'UTC'})"
+            if line.clock is None:
+                span = f"{ends[1] - ends[0]:.1f} s on a clock that nothing ties to UTC"
+            found.append("; ".join([f"{line.log.location}, {span}", *line.log.losses]))
     return UndeterminedError(
         "E-CLOCK-02",
         "the photos' clock cannot be brought to the log's",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from pipeline.engine.errors import UndeterminedError
+from pipeline.engine.errors import InputError, UndeterminedError
 from pipeline.engine.stage import Context
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geometry.arrays import Ints
@@ -32,7 +32,7 @@ from pipeline.sources.calibration import read_calibration
 from pipeline.sources.exposures import MarkFile
 from pipeline.sources.files import MARK_SUFFIXES, beside, is_url, opened, stem
 from pipeline.sources.intrinsics import SourcedCamera
-from pipeline.sources.logs import read_log
+from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES, read_log
 from pipeline.sources.mrk import read_marks
 from pipeline.sources.photos import PhotoRecord, read_photo
 from pipeline.sources.records import ImageStream
@@ -85,7 +85,12 @@ class Source:
 
 
 def read_sources(
-    context: Context, logs: Sequence[str], bags: Sequence[str], videos: Sequence[str], wishes: Wishes
+    context: Context,
+    logs: Sequence[str],
+    bags: Sequence[str],
+    videos: Sequence[str],
+    wishes: Wishes,
+    named: frozenset[str],
 ) -> list[Source]:
     """Reads logs, then bags with their images, then videos with their subtitles; each file once.
 
@@ -95,9 +100,10 @@ def read_sources(
         bags: Bags whose images are used.
         videos: Videos.
         wishes: What the user says.
+        named: Those that the user names one by one, not as a folder or glob of many.
 
     Returns:
-        The sources in that order.
+        The sources in that order; of a folder those that can be read.
 
     Raises:
         InputError: One cannot be read, has not the images or poses that the user names, or is called as another.
@@ -108,7 +114,18 @@ def read_sources(
     jobs = [("log", name) for name in logs if _place(name) not in read_anyway]
     jobs += [("bag", name) for name in bags] + [("video", name) for name in videos]
     read = partial(_read_sources, wishes)
-    sources = [source for part in context.map(read, jobs, shard=1, label="logs") for source in part]
+    sources: list[Source] = []
+    unread: list[InputError] = []
+    for (_, name), found in zip(jobs, context.map(read, jobs, shard=1, label="logs"), strict=True):
+        if isinstance(found, Source):
+            sources.append(found)
+        elif name in named or not name.lower().endswith((*LOG_SUFFIXES, *BAG_SUFFIXES)):
+            raise found
+        else:
+            unread.append(found)
+            context.warn(f"{name} is left out: {found.message} ({found.found})")
+    if unread and not sources:
+        raise unread[0]
     if sources:
         check_pose_topic([source.line.log for source in sources], wishes.pose_topic)
     return sources
@@ -119,16 +136,17 @@ def _place(name: str) -> str:
     return name if is_url(name) else str(Path(name).resolve())
 
 
-def _read_sources(wishes: Wishes, jobs: Sequence[tuple[str, str]]) -> list[Source]:
-    out = []
-    for kind, name in jobs:
+def _read_sources(wishes: Wishes, jobs: Sequence[tuple[str, str]]) -> Source | InputError:
+    """One source; what cannot be read comes back as the error, for whoever knows how it was named."""
+    ((kind, name),) = jobs
+    try:
         if kind == "video":
-            out.append(Source(timeline(read_log(_subtitles(name))), describe_video(name)[0], name))
-            continue
+            return Source(timeline(read_log(_subtitles(name))), describe_video(name)[0], name)
         log = read_log(name)
         stream = image_stream(log, wishes.image_topic) if kind == "bag" else None
-        out.append(Source(timeline(log, wishes.pose_topic, stream.frame if stream else None), stream))
-    return out
+    except InputError as error:
+        return error
+    return Source(timeline(log, wishes.pose_topic, stream.frame if stream else None), stream)
 
 
 def _subtitles(video: str) -> str:

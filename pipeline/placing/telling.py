@@ -44,11 +44,7 @@ def warn_of(
     context.count_items(len(usable), usable.count(False))
     for text in [*unread, *(f"{name}: {why}" for name, why in sorted(found.exposures.problems.items()))]:
         context.warn(f"exposure marks not used: {text}")
-    for line in lines:
-        for text in line.log.losses:
-            context.warn(f"{line.log.location}: {text}")
-    for text in placed.notes:
-        context.warn(text)
+    _warn_of_logs(context, placed, lines)
     lost, spare = placed.missing.get("photos", ()), placed.missing.get("triggers", ())
     if lost:
         context.warn(f"{counted(len(lost), 'photo')} missing on the card: {_some(lost)}")
@@ -56,11 +52,27 @@ def warn_of(
         context.warn(f"{counted(len(spare), 'exposure')} in the log left no photo: {_some(spare)}")
     _warn_of_unusable(context, found, len(usable))
     zoneless = [record.time_source for record in placed.records].count("exif (zone unknown)")
-    if zoneless and not stated:
+    if zoneless and not stated and not placed.clocks:
         context.warn(
             f"{zoneless} photos do not say their time zone; their local time is read as UTC (state the difference: "
             "--set ingest.clock_offset_s=-36000 for ten hours east)"
         )
+
+
+def _warn_of_logs(context: Context, placed: Placed, lines: Sequence[Timeline]) -> None:
+    """What is wrong with the logs, their clocks and mounts."""
+    for line in lines:
+        for text in line.log.losses:
+            context.warn(f"{line.log.location}: {text}")
+    for location in placed.idle:
+        holds = next(line for line in lines if line.log.location == location)
+        why = "it placed no image" if holds.places else "it holds no positions"
+        context.warn(f"{location} is not used: {why}")
+    for row in placed.clocks:
+        if row["problem"]:
+            context.warn(f"{row['clock_id']}: {row['method']}, {row['offset_s']:+.2f} s: {row['problem']}")
+    for text in placed.notes:
+        context.warn(text)
 
 
 def summary(found: Ingested) -> str:

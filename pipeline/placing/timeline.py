@@ -63,6 +63,12 @@ class Timeline:
         return self.clock.apply(log_ns) if self.clock is not None else np.asarray(log_ns, np.int64)
 
     @property
+    def names_images(self) -> bool:
+        """Whether its poses belong to named images, not to instants."""
+        stream = self.local if self.local is not None else self.positions
+        return stream is not None and bool(stream.image) and any(stream.image)
+
+    @property
     def places(self) -> bool:
         """Whether it holds positions at all."""
         return self.positions is not None or self.local is not None

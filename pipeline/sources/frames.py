@@ -200,7 +200,7 @@ def _identity(record: PhotoRecord, camera_id: str, root: str, clock_offset_s: fl
         "latitude_deg": record.position.latitude_deg if record.position else None,
         "longitude_deg": record.position.longitude_deg if record.position else None,
         "above_takeoff_m": record.relative_m,
-        "pose_source": ", ".join(sources),
+        "pose_source": ", ".join(dict.fromkeys(sources)),
         "usable": not record.problem,
         "problem": record.problem or "; ".join(record.notes),
     }

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from pipeline.engine.errors import InputError
-from pipeline.sources.files import is_url, opened
+from pipeline.sources.files import IMAGE_SUFFIXES, MARK_SUFFIXES, is_url, opened
 from pipeline.sources.records import FlightLog
 
 _HEAD_BYTES = 4096
@@ -86,6 +86,11 @@ def read_log(location: str) -> FlightLog:
     for known in FORMATS:
         if known.load("is_format")(head, location):
             return cast("FlightLog", known.load("read")(location))
+    if not head and not (not is_url(location) and Path(location).is_dir()):
+        raise InputError(
+            "E-LOG-04", "the log is empty", where=location, found="0 bytes", expected="a log",
+            hint="copy it again from the vehicle or card",
+        )  # fmt: skip
     raise InputError(
         "E-LOG-01",
         "no reader knows this file",
@@ -93,5 +98,16 @@ def read_log(location: str) -> FlightLog:
         found=f"begins with {head[:16]!r}" if head else "an empty file or folder",
         expected="ArduPilot .BIN/.log, MAVLink .tlog, PX4 .ulg, ROS .bag/.db3/.mcap, DJI .SRT/.csv, TUM or CSV "
         "trajectory, COLMAP model",
-        hint="check the file, or convert it to a CSV trajectory (docs/conventions.md has its columns)",
+        hint=_elsewhere(location)
+        or "check the file, or convert it to a CSV trajectory (docs/conventions.md has its columns)",
     )
+
+
+def _elsewhere(location: str) -> str:
+    """Where a file belongs that is no log by itself; empty for any other."""
+    name = location.lower()
+    if name.endswith(MARK_SUFFIXES):
+        return "exposure marks are read when they lie beside the photos"
+    if name.endswith("metadata.yaml"):
+        return "name the bag's folder"
+    return "images are photos: --photos" if name.endswith(IMAGE_SUFFIXES) else ""

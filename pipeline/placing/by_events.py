@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.clocks.intervals import Alignment, Alignments, align, doubts
 from pipeline.clocks.offsets import COARSE_TICK_S, FEWEST_MATCHES
 from pipeline.geometry.arrays import Floats
-from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, Refusal, log_ns_of
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, Refusal
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.records import Events
 
@@ -75,7 +75,7 @@ def _matched(
     has = best.event >= 0
     predicted_s = photo_s * (1.0 + best.drift) + best.offset_s + photos.tick_s / 2.0
     shared_ns = base_ns + np.rint(predicted_s * 1e9).astype(np.int64)
-    log_ns = np.where(has, events.time_ns[np.maximum(best.event, 0)], log_ns_of(line, shared_ns))
+    log_ns = np.where(has, events.time_ns[np.maximum(best.event, 0)], line.log_ns(shared_ns))
     offset_sigma_s = _offset_sigma_s(best, photos.tick_s)
     within_tick_s = photos.tick_s / np.sqrt(12.0) if photos.tick_s >= COARSE_TICK_S else best.sigma_s
     fit_sigma_s = float(np.hypot(offset_sigma_s, within_tick_s))

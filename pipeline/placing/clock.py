@@ -13,7 +13,7 @@ from pipeline.clocks.offsets import FEWEST_MATCHES
 from pipeline.clocks.places import offset_by_place
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.placing.by_events import by_events
-from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, Refusal, log_ns_of
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, Refusal
 from pipeline.placing.pose import LONGEST_POSITION_GAP_S, level_track
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.records import Positions
@@ -192,7 +192,7 @@ def _by_offset(
 ) -> ClockMatch:
     n = len(photos.records)
     return ClockMatch(
-        log_ns_of(line, shared_ns), np.full(n, sigma_s), np.full(n, -1, np.int64), ("",) * n,
+        line.log_ns(shared_ns), np.full(n, sigma_s), np.full(n, -1, np.int64), ("",) * n,
         method, offset_s, 0.0, sigma_s, None, anchors, None, note,
     )  # fmt: skip
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -180,19 +180,12 @@ def on_clock_of(line: Timeline, own: Timeline, time_ns: Nanoseconds) -> Nanoseco
     """Instants of one log's clock on another's, by way of UTC."""
     if line is own:
         return time_ns
-    utc_ns = own.utc_ns(time_ns)
-    if line.clock is None:
-        return utc_ns
-    guess = utc_ns - line.clock.offset_ns
-    return guess - (line.clock.apply(guess) - utc_ns)
+    return line.log_ns(own.utc_ns(time_ns))
 
 
 def as_photo(record: PhotoRecord, image: Extracted, line: Timeline) -> PhotoRecord:
     """The record of an image that was taken out of a log: named by its place in the run, timed by the log."""
-    time = None
-    if line.clock is not None:
-        utc_ns = int(line.utc_ns(np.array([image.log_ns], np.int64))[0])
-        time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns / 1000)
+    time = line.utc(image.log_ns)
     notes = (*record.notes, image.note) if image.note else record.notes
     return replace(
         record,

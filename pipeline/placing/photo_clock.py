@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.geometry.arrays import Floats, Ints
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.photos import PhotoRecord
 from pipeline.sources.records import Events
+from pipeline.sources.time_bases import UNIX_EPOCH
 
 # Which time tags say UTC: the others are a local time whose zone nobody wrote down.
 TRUSTED = frozenset({"utc_at_exposure", "gps", "exif+offset", "exif+gps zone"})
@@ -116,18 +117,9 @@ def _by_time(record: PhotoRecord) -> tuple[int, list[tuple[int, str]]]:
     return (0 if record.time is None else ns_of(record.time)), by_number(record.frame_id)
 
 
-def log_ns_of(line: Timeline, shared_ns: Nanoseconds) -> Nanoseconds:
-    """From the time photos and log share back to the log's own clock."""
-    if line.clock is None:
-        return shared_ns
-    guess = shared_ns - line.clock.offset_ns
-    # The drift is parts per million: one step is exact to a nanosecond.
-    return guess - (line.clock.apply(guess) - shared_ns)
-
-
 def ns_of(time: datetime) -> int:
     """Nanoseconds since 1970."""
-    since = time - datetime(1970, 1, 1, tzinfo=UTC)
+    since = time - UNIX_EPOCH
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 

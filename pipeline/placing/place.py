@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -249,12 +249,10 @@ class _Work:
 
 def _with_time(record: PhotoRecord, line: Timeline, log_ns: int, source: str) -> PhotoRecord:
     """The exposure's UTC as the log says it; a log that knows no UTC leaves the photo's own time."""
-    if line.clock is None:
+    time = line.utc(log_ns)
+    if time is None:
         return replace(record, time_source=f"{source}, {record.time_source} as time" if record.time else source)
-    utc_ns = int(line.utc_ns(np.array([log_ns], np.int64))[0])
-    return replace(
-        record, time=datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns / 1000), time_source=source
-    )
+    return replace(record, time=time, time_source=source)
 
 
 def _with_attitude(record: PhotoRecord, poses: CameraPoses, k: int) -> PhotoRecord:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from pipeline.geometry.rotations import (
 )
 from pipeline.sources.bags.frame_tree import transform_between
 from pipeline.sources.records import Attitudes, Events, FixedTransform, FlightLog, LocalPoses, Positions
+from pipeline.sources.time_bases import UNIX_EPOCH
 from pipeline.tracks.mount import Mount
 
 # Forward-left-up (ROS, REP 103) and forward-right-down differ by half a turn about forward.
@@ -61,6 +63,20 @@ class Timeline:
     def utc_ns(self, log_ns: Nanoseconds) -> Nanoseconds:
         """Instants on UTC, or unchanged where nothing ties the clock to it."""
         return self.clock.apply(log_ns) if self.clock is not None else np.asarray(log_ns, np.int64)
+
+    def log_ns(self, utc_ns: Nanoseconds) -> Nanoseconds:
+        """From UTC, or the time shared where nothing ties the clock to it, back to the log's own clock."""
+        if self.clock is None:
+            return utc_ns
+        guess = utc_ns - self.clock.offset_ns
+        # The drift is parts per million: one step is exact to a nanosecond.
+        return guess - (self.clock.apply(guess) - utc_ns)
+
+    def utc(self, log_ns: int) -> datetime | None:
+        """The UTC of one instant; None where nothing ties the clock to it."""
+        if self.clock is None:
+            return None
+        return UNIX_EPOCH + timedelta(microseconds=int(self.utc_ns(np.array([log_ns], np.int64))[0]) / 1000)
 
     @property
     def names_images(self) -> bool:

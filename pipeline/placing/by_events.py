@@ -100,15 +100,13 @@ def _matched(
 
 
 def _offset_sigma_s(best: Alignment, tick_s: float) -> float:
-    """How well the events tell the offset; within a coarse tick, what the spread of the residuals leaves open.
+    """How well the events tell the offset; within a tick, what the spread of the residuals leaves open.
 
-    Exposures on the beat of a coarse clock all show the same fraction of it: no number of them tells which.
+    Exposures on the beat of a clock all show the same fraction of its tick: no number of them tells which.
     """
     known = best.residual_s[np.isfinite(best.residual_s)]
     averaged_s = best.sigma_s / np.sqrt(len(known))
-    if tick_s < COARSE_TICK_S:
-        return float(averaged_s)
-    return float(max(tick_s - np.ptp(known), averaged_s) / np.sqrt(12.0))
+    return float(np.hypot(averaged_s, max(tick_s - np.ptp(known), 0.0) / np.sqrt(12.0)))
 
 
 def _undecided(

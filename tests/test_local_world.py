@@ -53,7 +53,7 @@ def settings(crs: str) -> Any:
 
 def test_the_crs_is_an_engineering_one_with_three_axes_in_metres() -> None:
     crs = LocalTransform().crs
-    assert crs.type_name == "Engineering CRS"
+    assert [part.type_name for part in crs.sub_crs_list] == ["Engineering CRS", "Vertical CRS"]
     assert [(axis.direction, axis.unit_conversion_factor) for axis in crs.axis_info] == [
         ("east", 1.0),
         ("north", 1.0),
@@ -117,7 +117,7 @@ def test_geoparquet_holds_the_crs_twice(points: Path) -> None:
     assert (dataset.crs, dataset.rows, len(dataset.files)) == (LOCAL, 3000, 4)
     metadata = pq.read_metadata(dataset.files[0])
     geo = json.loads(metadata.metadata[b"geo"])["columns"]["geometry"]
-    assert geo["crs"]["type"] == "EngineeringCRS"
+    assert geo["crs"]["type"] == "CompoundCRS"
     kind = json.loads(metadata.schema.column(0).logical_type.to_json())
     assert CRS.from_json(kind["crs"]) == LOCAL
     assert geopandas.read_parquet(dataset.files[0]).crs == LOCAL
@@ -141,7 +141,7 @@ def test_every_format_takes_it(points: Path, tmp_path: Path, suffix: str) -> Non
     if suffix in {".las", ".laz"}:
         las = laspy.read(path)
         crs, z = las.header.parse_crs(), np.asarray(las.z)
-        assert las.header.vlrs.get("WktCoordinateSystemVlr")[0].string.startswith("LOCAL_CS[")
+        assert las.header.vlrs.get("WktCoordinateSystemVlr")[0].string.startswith('COMPD_CS["local frame",LOCAL_CS[')
     elif suffix == ".gpkg":
         frame = geopandas.read_file(path)
         crs, z = frame.crs, frame.geometry.z.to_numpy()

@@ -13,10 +13,13 @@ from pipeline.geometry.arrays import Floats
 # What ingest says of a run's world. Poses of motion capture, SLAM or a reconstruction know no latitude and longitude.
 EARTH, LOCAL_WORLD = "earth", "local"
 
-# An engineering CRS (ISO 19162:2019, 11), the kind for what is placed by itself alone.
+# An engineering CRS (ISO 19162:2019, 11), the kind for what is placed by itself alone, with heights that are so, too.
 LOCAL_WKT = (
-    'ENGCRS["local frame",EDATUM["local"],CS[Cartesian,3],AXIS["easting (X)",east],AXIS["northing (Y)",north],'
-    'AXIS["height (Z)",up],LENGTHUNIT["metre",1]]'
+    'COMPOUNDCRS["local frame",'
+    'ENGCRS["local frame, level",EDATUM["local"],CS[Cartesian,2],AXIS["easting (X)",east],AXIS["northing (Y)",north],'
+    'LENGTHUNIT["metre",1]],'
+    'VERTCRS["local height",VDATUM["local zero"],CS[vertical,1],AXIS["gravity-related height (H)",up],'
+    'LENGTHUNIT["metre",1]]]'
 )
 
 

@@ -80,13 +80,13 @@ def wkt1(crs: CRS) -> str:
     """The CRS as LAS wants it: WKT 1 (OGC 01-009), its vertical part kept.
 
     Args:
-        crs: A compound, a three-dimensional projected or an engineering CRS.
+        crs: A compound or a three-dimensional projected CRS.
 
     Returns:
-        A COMPD_CS; WKT 1 has no three-dimensional projected CRS, so ellipsoidal height becomes its vertical part. An
-        engineering CRS is a LOCAL_CS with its three axes.
+        A COMPD_CS; WKT 1 has no three-dimensional projected CRS, so ellipsoidal height becomes its vertical part. The
+        horizontal part of a local frame is a LOCAL_CS.
     """
-    if crs.is_compound or crs.is_engineering:
+    if crs.is_compound:
         return str(crs.to_wkt("WKT1_GDAL"))
     horizontal = crs.to_2d()
     return f'COMPD_CS["{crs.name} + ellipsoidal height",{horizontal.to_wkt("WKT1_GDAL")},{_ELLIPSOID_WKT1}]'

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 from pyproj import CRS, Transformer
 
+from pipeline.geodesy.local_world import is_engineering
 from pipeline.points.geoparquet import TileFile
 from schemas import POINTS
 from schemas.points import GEOMETRY
@@ -88,7 +89,7 @@ def item(files: Sequence[TileFile], crs: CRS, item_id: str, description: str) ->
 
 def _where(crs: CRS, bounds: Sequence[float]) -> dict[str, Any]:
     """Footprint and box in longitude and latitude; an engineering CRS has none, and then STAC forbids the box."""
-    if crs.is_engineering:
+    if is_engineering(crs):
         return {"geometry": None}
     ring = _footprint(crs, bounds)
     corners = np.array(ring)

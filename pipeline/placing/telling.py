@@ -50,10 +50,6 @@ def warn_of(
         context.warn(f"{counted(len(lost), 'photo')} missing on the card: {_some(lost)}")
     if spare:
         context.warn(f"{counted(len(spare), 'exposure')} in the log left no photo: {_some(spare)}")
-    for camera in found.cameras.to_pylist():
-        if camera["source"].startswith("EXIF"):
-            told = f"{camera['camera_id']}: focal length from {camera['source']}, distortion not known"
-            context.warn(f"{told} (a calibration is better: ingest.camera, --camera FILE)")
     _warn_of_unusable(context, found, len(usable))
     zoneless = [record.time_source for record in placed.records].count("exif (zone unknown)")
     if zoneless and not stated and not placed.clocks:
@@ -61,6 +57,10 @@ def warn_of(
             f"{zoneless} photos do not say their time zone; their local time is read as UTC (state the difference: "
             "--set ingest.clock_offset_s=-36000 for ten hours east)"
         )
+    for camera in found.cameras.to_pylist():
+        if camera["source"].startswith("EXIF"):
+            told = f"{camera['camera_id']}: focal length from {camera['source']}, distortion not known"
+            context.warn(f"{told} (a calibration is better: ingest.camera, --camera FILE)")
 
 
 def _warn_of_logs(context: Context, placed: Placed, lines: Sequence[Timeline]) -> None:

@@ -13,7 +13,7 @@ from pipeline.engine.errors import EpiTransferError
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.geodesy.heights import height_datum
 from pipeline.placing import steps
-from pipeline.placing.locate import files_of, find_logs, find_videos, named
+from pipeline.placing.locate import files_of, find_logs, find_videos, listed
 from pipeline.placing.tables import clock_row, track_pieces
 from pipeline.placing.telling import record_facts, summary, warn_of
 from pipeline.sources.accuracy import local_sigmas
@@ -105,8 +105,10 @@ def run(config: Config, context: Context) -> str:
     """Reads everything and writes the tables; an image that cannot be used is a row with its reason."""
     wishes = _wishes(config)
     root, photos = photo_root(config), _photos(config)
-    sure = named(config.logs) | named(config.bags)
-    sources = steps.read_sources(context, find_logs(config.logs), find_logs(config.bags), _videos(config), wishes, sure)
+    logs, bags, videos = find_logs(config.logs), find_logs(config.bags), find_videos(config.videos)
+    # What is wrong with a log named by itself is an error, not a note beside the others of its folder.
+    named = frozenset([*listed(config.logs), *listed(config.bags)])
+    sources = steps.read_sources(context, logs, bags, videos, wishes, named)
     images = steps.extract(context, sources, wishes)
     records = steps.read_photos(context, photos, images, sources, wishes)
     placed = steps.placed(records, images, sources, wishes)
@@ -151,13 +153,13 @@ def photo_root(config: Config) -> str:
     The images' paths are relative to it.
     """
     photos = _photos(config)
-    named = [*photos, *beside(photos, MARK_SUFFIXES)] or [*find_logs(config.bags), *_videos(config)]
+    named = [*photos, *beside(photos, MARK_SUFFIXES)] or [*find_logs(config.bags), *find_videos(config.videos)]
     return common_root(named)
 
 
 def sources(config: Config) -> Sequence[Path | str]:
     """The files whose bytes decide: photos, marks, logs, bags, videos and subtitles, calibration, geoid grid."""
-    photos, videos = _photos(config), _videos(config)
+    photos, videos = _photos(config), find_videos(config.videos)
     named = [*photos, *beside(photos, MARK_SUFFIXES), *videos]
     named += files_of([*find_logs(config.logs), *find_logs(config.bags)])
     named += [text for text in (config.camera, config.geoid, *map(srt_beside, videos)) if isinstance(text, str)]
@@ -165,15 +167,7 @@ def sources(config: Config) -> Sequence[Path | str]:
 
 
 def _photos(config: Config) -> list[str]:
-    return find_images(_listed(config.photos)) if config.photos else []
-
-
-def _videos(config: Config) -> list[str]:
-    return find_videos(_listed(config.videos))
-
-
-def _listed(names: _Paths) -> Sequence[str]:
-    return [] if names is None else [names] if isinstance(names, str) else list(names)
+    return find_images(config.photos) if config.photos else []
 
 
 STAGE = Stage(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from pipeline.engine.errors import InputError, UndeterminedError
 from pipeline.flight import RUN_IMAGES
 from pipeline.geometry.arrays import Ints
 from pipeline.placing.clock import no_overlap_hint
+from pipeline.placing.photo_clock import span_text
 from pipeline.placing.place import Stamp
 from pipeline.placing.pose import camera_poses
 from pipeline.placing.timeline import Timeline
@@ -140,7 +140,7 @@ def wanted(
     stated_ns = round((clock_offset_s or 0.0) * 1e9)
     for line in [own, *others]:
         if line.places:
-            at_ns = stream.time_ns if line is own else on_clock_of(line, own, stream.time_ns + stated_ns)
+            at_ns = stream.time_ns if line is own else line.log_ns(own.utc_ns(stream.time_ns + stated_ns))
             chosen = spaced(camera_poses(line, at_ns, mount, y_up=y_up).centre_m, spacing_m)
             if len(chosen):
                 return chosen
@@ -157,7 +157,7 @@ def _nowhere(own: Timeline, others: Sequence[Timeline], stream: ImageStream) -> 
         if poses is not None and len(poses.time_ns) and len(images_ns):
             first_ns, last_ns = line.utc_ns(poses.time_ns[[0, -1]]).tolist()
             found.append(
-                f"images {_span(*images_ns[[0, -1]].tolist())}, {line.log.location} {_span(first_ns, last_ns)}"
+                f"images {span_text(*images_ns[[0, -1]].tolist())}, {line.log.location} {span_text(first_ns, last_ns)}"
             )
             if not np.any((images_ns >= first_ns) & (images_ns <= last_ns)):
                 hints.append(no_overlap_hint(images_ns, first_ns, last_ns, "images"))
@@ -169,18 +169,6 @@ def _nowhere(own: Timeline, others: Sequence[Timeline], stream: ImageStream) -> 
         expected="poses in the same file (topics of poses or GNSS fixes; an .SRT beside a video), or a log with UTC",
         hint="; ".join(hints),
     )
-
-
-def _span(first_ns: int, last_ns: int) -> str:
-    first, last = (datetime.fromtimestamp(t / 1e9, UTC) for t in (first_ns, last_ns))
-    return f"{first:%Y-%m-%d %H:%M:%S} .. {last:%H:%M:%S}"
-
-
-def on_clock_of(line: Timeline, own: Timeline, time_ns: Nanoseconds) -> Nanoseconds:
-    """Instants of one log's clock on another's, by way of UTC."""
-    if line is own:
-        return time_ns
-    return line.log_ns(own.utc_ns(time_ns))
 
 
 def as_photo(record: PhotoRecord, image: Extracted, line: Timeline) -> PhotoRecord:

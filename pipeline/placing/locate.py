@@ -11,6 +11,11 @@ from pipeline.sources.logs import BAG_SUFFIXES, LOG_SUFFIXES, is_log_folder
 from pipeline.sources.video import VIDEO_SUFFIXES
 
 
+def listed(names: str | Sequence[str] | None) -> list[str]:
+    """What the user names, one by one: one name, several or none."""
+    return [] if names is None else [names] if isinstance(names, str) else list(names)
+
+
 def find_logs(names: str | Sequence[str] | None) -> list[str]:
     """Logs and bags of a path, glob or list of these, sorted and each once.
 
@@ -25,9 +30,8 @@ def find_logs(names: str | Sequence[str] | None) -> list[str]:
     Raises:
         InputError: A named path does not exist, or a folder holds no log.
     """
-    listed = [] if names is None else [names] if isinstance(names, str) else list(names)
     found: set[str] = set()
-    for name in listed:
+    for name in listed(names):
         if is_log_folder(name):
             found.add(name)
             continue
@@ -42,16 +46,11 @@ def find_logs(names: str | Sequence[str] | None) -> list[str]:
     return sorted(found)
 
 
-def named(names: str | Sequence[str] | None) -> frozenset[str]:
-    """Sources that the user names one by one: what is wrong with those is an error, not a note beside the others."""
-    return frozenset([] if names is None else [names] if isinstance(names, str) else names)
-
-
-def find_videos(names: Sequence[str]) -> list[str]:
+def find_videos(names: str | Sequence[str] | None) -> list[str]:
     """Videos of paths, folders or globs, sorted and each once.
 
     Args:
-        names: What the user names.
+        names: What the user names; None for nothing.
 
     Returns:
         Locations.
@@ -60,7 +59,7 @@ def find_videos(names: Sequence[str]) -> list[str]:
         InputError: A named path does not exist, or holds no video.
     """
     found: set[str] = set()
-    for name in names:
+    for name in listed(names):
         hits = find(name, VIDEO_SUFFIXES)
         if not hits:
             raise InputError(

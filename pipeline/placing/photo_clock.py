@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -115,6 +115,12 @@ def by_number(name: str) -> list[tuple[int, str]]:
 
 def _by_time(record: PhotoRecord) -> tuple[int, list[tuple[int, str]]]:
     return (0 if record.time is None else ns_of(record.time)), by_number(record.frame_id)
+
+
+def span_text(first_ns: int, last_ns: int) -> str:
+    """Two instants of UTC, ns since 1970, as one span for people."""
+    first, last = (datetime.fromtimestamp(t / 1e9, UTC) for t in (first_ns, last_ns))
+    return f"{first:%Y-%m-%d %H:%M:%S} .. {last:%H:%M:%S}"
 
 
 def ns_of(time: datetime) -> int:

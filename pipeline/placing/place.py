@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -17,7 +16,7 @@ from pipeline.geometry.rotations import gimbal_angles
 from pipeline.placing.clock import match_clock
 from pipeline.placing.missing import unclaimed
 from pipeline.placing.named import by_name
-from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, image_times, photo_times
+from pipeline.placing.photo_clock import ClockMatch, PhotoTimes, image_times, photo_times, span_text
 from pipeline.placing.pose import CameraPoses, camera_poses
 from pipeline.placing.timeline import Timeline
 from pipeline.sources.accuracy import TimingSigmas
@@ -311,17 +310,15 @@ def _unmatched(
 ) -> UndeterminedError:
     """Both time spans, and why no method brought them together."""
     photos = photo_times(group)
-    first, last = photos.records[0], photos.records[-1]
-    zone = first.time_source if photos.trusted else "EXIF, no time zone"
-    found = [f"{len(group)} {clock}, {first.time:%Y-%m-%d %H:%M:%S} .. {last.time:%H:%M:%S} ({zone})"]
+    zone = photos.records[0].time_source if photos.trusted else "EXIF, no time zone"
+    found = [f"{len(group)} {clock}, {span_text(*photos.time_ns[[0, -1]].tolist())} ({zone})"]
     for line in lines:
         stream = line.positions or line.local
         if stream is not None and len(stream.time_ns):
-            ends = line.utc_ns(stream.time_ns[[0, -1]]) / 1e9
-            begin, end = (datetime.fromtimestamp(float(t), UTC) for t in ends)
-            span = f"{begin:%Y-%m-%d %H:%M:%S} .. {end:%H:%M:%S} ({line.log.time_base.source or 'UTC'})"
+            first_ns, last_ns = line.utc_ns(stream.time_ns[[0, -1]]).tolist()
+            span = f"{span_text(first_ns, last_ns)} ({line.log.time_base.source or 'UTC'})"
             if line.clock is None:
-                span = f"{ends[1] - ends[0]:.1f} s on a clock that nothing ties to UTC"
+                span = f"{(last_ns - first_ns) / 1e9:.1f} s on a clock that nothing ties to UTC"
             found.append("; ".join([f"{line.log.location}, {span}", *line.log.losses]))
     return UndeterminedError(
         "E-CLOCK-02",

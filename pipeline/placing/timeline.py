@@ -82,7 +82,7 @@ class Timeline:
     def names_images(self) -> bool:
         """Whether its poses belong to named images, not to instants."""
         stream = self.local if self.local is not None else self.positions
-        return stream is not None and bool(stream.image) and any(stream.image)
+        return stream is not None and any(stream.image)
 
     @property
     def places(self) -> bool:

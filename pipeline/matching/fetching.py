@@ -1,0 +1,243 @@
+"""Fetching weights: resumed where a connection was cut, kept only if the digest is right."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+from urllib.parse import urlsplit
+
+import requests
+
+from pipeline.engine.digests import digest_file
+from pipeline.engine.errors import InputError, ResourceError
+from pipeline.engine.progress import Reporter
+from pipeline.matching.known_weights import KnownWeights
+
+_BLOCK = 1 << 16
+_CONNECT_S, _READ_S = 15.0, 60.0
+# Far above any known file: a server that never ends must not fill the disk.
+_MOST_BYTES = 1 << 29
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A file of weights that lies in its folder, its digest verified.
+
+    Args:
+        known: Which.
+        path: Where.
+        fresh: Whether it had to be fetched.
+    """
+
+    known: KnownWeights
+    path: Path
+    fresh: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Download:
+    url: str
+    part: Path
+    sha256: str
+    most_bytes: int
+
+
+def fetch(wanted: Sequence[KnownWeights], folder: Path, reporter: Reporter) -> Iterator[Fetched]:
+    """Fetches files that are not yet in a folder; an archive that several are in only once.
+
+    What an interrupt leaves, NAME.part, is carried on with next time. A file that was there with another content is
+    kept as NAME.old.
+
+    Args:
+        wanted: Files that have an address.
+        folder: Where to put them; made if it does not exist.
+        reporter: Shows the progress.
+
+    Yields:
+        Each file, in the order of their addresses.
+
+    Raises:
+        InputError: The address has no such file, or another than the known one.
+        ResourceError: The address cannot be reached, or the connection was cut.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ResourceError("E-WEIGHTS-09", "not a folder", where=str(folder), hint="give a folder: --to FOLDER")
+    missing: dict[str, list[KnownWeights]] = {}
+    for known in wanted:
+        path = folder / known.file
+        if path.is_file() and digest_file(path) == known.sha256:
+            yield Fetched(known, path, fresh=False)
+        elif known.url:
+            missing.setdefault(known.url, []).append(known)
+    for url, files in missing.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        yield from _fetch_address(url, files, folder, reporter)
+
+
+def _fetch_address(url: str, files: list[KnownWeights], folder: Path, reporter: Reporter) -> Iterator[Fetched]:
+    first = files[0]
+    name = Path(urlsplit(url).path).name if first.member else first.file
+    download = _Download(
+        url,
+        folder / f"{name}.part",
+        (first.archive_sha256 or "") if first.member else first.sha256,
+        _MOST_BYTES if first.member else first.size_bytes or _MOST_BYTES,
+    )
+    _download(download, name, reporter)
+    for known in files:
+        path = folder / known.file
+        source = _extracted(download, known) if known.member else download.part
+        if path.exists():
+            path.replace(path.with_name(f"{path.name}.old"))
+            reporter.say(f"{path} had another content and is kept as {path.name}.old")
+        source.replace(path)
+        yield Fetched(known, path, fresh=True)
+    download.part.unlink(missing_ok=True)
+
+
+def _download(download: _Download, name: str, reporter: Reporter) -> None:
+    """Makes `download.part` the whole file, its digest verified."""
+    part = download.part
+    have = part.stat().st_size if part.is_file() else 0
+    if not (have and digest_file(part) == download.sha256):
+        with _network(download):
+            _receive(download, have, name, reporter)
+    found = digest_file(part)
+    if found != download.sha256:
+        size = part.stat().st_size
+        part.unlink()
+        raise _differs(download, f"{size} bytes, sha256 {found}", download.sha256)
+
+
+def _receive(download: _Download, have: int, name: str, reporter: Reporter) -> None:
+    with _answer(download, have) as answer:
+        # A server that knows no ranges, and one for whom the rest is none, begins anew.
+        resumed = answer.status_code == requests.codes.partial_content
+        have = have if resumed else 0
+        rest = int(answer.headers.get("Content-Length") or 0)
+        with reporter.meter("models", f"KiB of {name}", (have + rest) >> 10) as meter, _written(download.part) as path:
+            meter.advance(have >> 10)
+            with path.open("ab" if resumed else "wb") as stream:
+                for block in answer.iter_content(_BLOCK):
+                    stream.write(block)
+                    have += len(block)
+                    if have > download.most_bytes:
+                        break
+                    meter.advance(len(block) >> 10)
+    if have > download.most_bytes:
+        download.part.unlink()
+        raise _differs(download, "a longer file", f"at most {download.most_bytes} bytes, sha256 {download.sha256}")
+
+
+@contextmanager
+def _answer(download: _Download, have: int) -> Iterator[requests.Response]:
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
+    with requests.get(download.url, headers=headers, stream=True, timeout=(_CONNECT_S, _READ_S)) as answer:
+        for hop in (*answer.history, answer):
+            _refuse_insecure(hop.url)
+        matched = answer.headers.get("Content-Range", "").startswith(f"bytes {have}-")
+        if answer.status_code == requests.codes.ok or (
+            answer.status_code == requests.codes.partial_content and matched
+        ):
+            yield answer
+            return
+    if have and answer.status_code in {requests.codes.requested_range_not_satisfiable, requests.codes.partial_content}:
+        with _answer(download, 0) as again:
+            yield again
+        return
+    raise InputError(
+        "E-WEIGHTS-07",
+        "the address does not give the file",
+        where=download.url,
+        found=f"HTTP {answer.status_code} {answer.reason}",
+        hint=_by_hand(download),
+    )
+
+
+def _refuse_insecure(url: str) -> None:
+    parts = urlsplit(url)
+    if parts.scheme != "https" and parts.hostname not in _LOCAL:
+        raise InputError("E-WEIGHTS-07", "only https is fetched from", where=url, found=parts.scheme, expected="https")
+
+
+@contextmanager
+def _network(download: _Download) -> Iterator[None]:
+    """Explains what the network does; a `requests` error is an OSError, too, and must not pass for one of the disk."""
+    try:
+        _refuse_insecure(download.url)
+        yield
+    except requests.RequestException as error:
+        have = download.part.stat().st_size if download.part.is_file() else 0
+        kept = f"; {have} bytes are kept, and the same command carries on" if have else ""
+        late = isinstance(error, requests.Timeout)
+        raise ResourceError(
+            "E-WEIGHTS-08",
+            "the address does not answer in time" if late else "the network fails",
+            where=download.url,
+            found=f"{type(error).__name__}: {error}"[:300] + kept,
+            hint=_by_hand(download),
+        ) from error
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[Path]:
+    """Lets an error of the disk tell the file."""
+    try:
+        yield path
+    except OSError as error:
+        if isinstance(error, requests.RequestException) or error.filename:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _by_hand(download: _Download) -> str:
+    return f"check the connection; or fetch it elsewhere and put it into {download.part.parent} by hand"
+
+
+def _differs(download: _Download, found: str, expected: str) -> InputError:
+    return InputError(
+        "E-WEIGHTS-02",
+        "the address gives another file than the known one; it was not kept",
+        where=download.url,
+        found=found,
+        expected=expected,
+        hint="try again; if it stays so, the publisher has changed the file, or something between changes it",
+    )
+
+
+def _extracted(download: _Download, known: KnownWeights) -> Path:
+    """One member of an archive, beside it; its name is ours, never the archive's."""
+    path = download.part.with_name(f"{known.file}.part")
+    most = known.size_bytes or _MOST_BYTES
+    try:
+        with (
+            _written(path),
+            zipfile.ZipFile(download.part) as archive,
+            archive.open(str(known.member)) as member,
+            path.open("wb") as stream,
+        ):
+            found = _copied(member, stream, most)
+    except (zipfile.BadZipFile, KeyError, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        path.unlink(missing_ok=True)
+        raise _differs(download, f"{type(error).__name__}: {error}", f"an archive with {known.member}") from error
+    if found != known.sha256:
+        path.unlink()
+        raise _differs(download, f"{known.member} with sha256 {found}", known.sha256)
+    return path
+
+
+def _copied(source: IO[bytes], target: IO[bytes], most_bytes: int) -> str:
+    """Copies at most one byte more than allowed; returns the digest of what was copied."""
+    state, left = hashlib.sha256(), most_bytes + 1
+    while block := source.read(min(_BLOCK, left)):
+        state.update(block)
+        target.write(block)
+        left -= len(block)
+    return state.hexdigest()

@@ -15,7 +15,7 @@ import typer.main
 from pipeline.engine.errors import EpiTransferError, ResourceError
 from pipeline.engine.threads import limit_threads
 
-# Name: (module, function, help). The modules are heavy, so that --help does not load them.
+# Name: (module, function or Typer app, help). The modules are heavy, so that --help does not load them.
 COMMANDS: dict[str, tuple[str, str, str]] = {
     "run": ("stages.run", "command", "Run every stage of a workflow; what is up to date is skipped."),
     "ingest": ("stages.stage_command", "ingest", "Read photos, logs and bags into frames and their poses."),
@@ -30,8 +30,13 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "inspect": ("stages.inspect", "command", "Tell what photos, logs, bags, tiles or tables hold."),
     "configure": ("stages.configure", "command", "Keep a workflow in a run folder, with slices of it for Make."),
     "status": ("stages.status", "command", "Tell which stages are fresh, stale or missing, and why."),
+    "models": ("stages.models", "app", "List, fetch and verify the weights of the networks."),
     "schema": ("stages.schema", "command", "Show the tables: column, type, unit, frame, meaning."),
-    "doctor": ("stages.doctor", "command", "Check versions, optional parts, PROJ grids, disk and memory."),
+    "doctor": (
+        "stages.doctor",
+        "command",
+        "Check versions, weights, PROJ grids, GPU, disk and memory.",
+    ),
 }
 
 
@@ -39,10 +44,13 @@ class _Deferred(typer.core.TyperCommand):
     """A command that is known by name and help until it is called."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        module, function, _ = COMMANDS[str(self.name)]
-        single = typer.Typer(add_completion=False, rich_markup_mode=None)
-        single.command(self.name, help=self.help)(getattr(importlib.import_module(module), function))
-        return typer.main.get_command(single).make_context(info_name, args, parent=parent, **extra)
+        module, name, _ = COMMANDS[str(self.name)]
+        found = getattr(importlib.import_module(module), name)
+        if not isinstance(found, typer.Typer):  # which a command of several is
+            single = typer.Typer(add_completion=False, rich_markup_mode=None)
+            single.command(self.name, help=self.help)(found)
+            found = single
+        return typer.main.get_command(found).make_context(info_name, args, parent=parent, **extra)
 
 
 class _Commands(typer.core.TyperGroup):

@@ -14,9 +14,11 @@ import pyproj
 import typer
 
 from pipeline.clocks.gps import TABLE_HOLDS_UNTIL
-from pipeline.engine.errors import UndeterminedError
+from pipeline.engine.errors import MissingPartError, UndeterminedError
 from pipeline.engine.executors import usable_cores
 from pipeline.geodesy.heights import Geoid
+from pipeline.matching.known_weights import NETWORKS_OF
+from pipeline.matching.weights import compute_device, find_weights
 
 REQUIRED = (
     "numpy",
@@ -29,6 +31,7 @@ REQUIRED = (
     "pydantic",
     "torch",
     "kornia",
+    "safetensors",
     "pymavlink",
     "pyulog",
     "rosbags",
@@ -41,11 +44,13 @@ DATUMS = ("egm96", "egm2008")
 
 
 def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False) -> None:
-    """Checks versions, optional parts, PROJ grids, disk and memory."""
+    """Checks versions, optional parts, weights, PROJ grids, GPU, disk and memory."""
     found = {
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in REQUIRED},
         "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
+        "weights": {"/".join(group): _weights(group) for needs in NETWORKS_OF.values() for group in needs},
+        "torch_device": compute_device(),
         "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(name) for name in DATUMS}},
         "leap_seconds_known_until": f"{TABLE_HOLDS_UNTIL:%Y-%m-%d}",
         "cores": usable_cores(),
@@ -77,3 +82,10 @@ def _grid(datum: str) -> str:
     except UndeterminedError:
         return "missing: state ingest.geoid, or install the grid with projsync"
     return "installed"
+
+
+def _weights(networks: tuple[str, ...]) -> str:
+    try:
+        return str(find_weights(networks).path)
+    except MissingPartError as error:
+        return f"missing: {error.hint.partition(';')[0]}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import requests
 
@@ -47,6 +48,7 @@ class _Download:
     part: Path
     sha256: str
     most_bytes: int
+    wanted: str
 
 
 def fetch(wanted: Sequence[KnownWeights], folder: Path, reporter: Reporter) -> Iterator[Fetched]:
@@ -77,7 +79,6 @@ def fetch(wanted: Sequence[KnownWeights], folder: Path, reporter: Reporter) -> I
         elif known.url:
             missing.setdefault(known.url, []).append(known)
     for url, files in missing.items():
-        folder.mkdir(parents=True, exist_ok=True)
         yield from _fetch_address(url, files, folder, reporter)
 
 
@@ -89,6 +90,7 @@ def _fetch_address(url: str, files: list[KnownWeights], folder: Path, reporter: 
         folder / f"{name}.part",
         (first.archive_sha256 or "") if first.member else first.sha256,
         _MOST_BYTES if first.member else first.size_bytes or _MOST_BYTES,
+        ", ".join(f"its {known.member}" if known.member else known.file for known in files),
     )
     _download(download, name, reporter)
     for known in files:
@@ -113,7 +115,7 @@ def _download(download: _Download, name: str, reporter: Reporter) -> None:
     if found != download.sha256:
         size = part.stat().st_size
         part.unlink()
-        raise _differs(download, f"{size} bytes, sha256 {found}", download.sha256)
+        raise _differs(download, f"{size} bytes, sha256 {found}", f"sha256 {download.sha256}")
 
 
 def _receive(download: _Download, have: int, name: str, reporter: Reporter) -> None:
@@ -124,6 +126,7 @@ def _receive(download: _Download, have: int, name: str, reporter: Reporter) -> N
         rest = int(answer.headers.get("Content-Length") or 0)
         with reporter.meter("models", f"KiB of {name}", (have + rest) >> 10) as meter, _written(download.part) as path:
             meter.advance(have >> 10)
+            path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if resumed else "wb") as stream:
                 for block in answer.iter_content(_BLOCK):
                     stream.write(block)
@@ -139,9 +142,8 @@ def _receive(download: _Download, have: int, name: str, reporter: Reporter) -> N
 @contextmanager
 def _answer(download: _Download, have: int) -> Iterator[requests.Response]:
     headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
-    with requests.get(download.url, headers=headers, stream=True, timeout=(_CONNECT_S, _READ_S)) as answer:
-        for hop in (*answer.history, answer):
-            _refuse_insecure(hop.url)
+    hooks = {"response": _refuse_insecure_redirect}
+    with requests.get(download.url, headers=headers, hooks=hooks, stream=True, timeout=(_CONNECT_S, _READ_S)) as answer:
         matched = answer.headers.get("Content-Range", "").startswith(f"bytes {have}-")
         if answer.status_code == requests.codes.ok or (
             answer.status_code == requests.codes.partial_content and matched
@@ -161,6 +163,11 @@ def _answer(download: _Download, have: int) -> Iterator[requests.Response]:
     )
 
 
+def _refuse_insecure_redirect(answer: requests.Response, **_: object) -> None:
+    if answer.is_redirect:
+        _refuse_insecure(urljoin(answer.url, answer.headers["Location"]))
+
+
 def _refuse_insecure(url: str) -> None:
     parts = urlsplit(url)
     if parts.scheme != "https" and parts.hostname not in _LOCAL:
@@ -177,11 +184,12 @@ def _network(download: _Download) -> Iterator[None]:
         have = download.part.stat().st_size if download.part.is_file() else 0
         kept = f"; {have} bytes are kept, and the same command carries on" if have else ""
         late = isinstance(error, requests.Timeout)
+        cause = re.search(r"Caused by (.*)\)$", str(error))
         raise ResourceError(
             "E-WEIGHTS-08",
             "the address does not answer in time" if late else "the network fails",
             where=download.url,
-            found=f"{type(error).__name__}: {error}"[:300] + kept,
+            found=(cause[1] if cause else f"{type(error).__name__}: {error}")[:200] + kept,
             hint=_by_hand(download),
         ) from error
 
@@ -198,7 +206,7 @@ def _written(path: Path) -> Iterator[Path]:
 
 
 def _by_hand(download: _Download) -> str:
-    return f"check the connection; or fetch it elsewhere and put it into {download.part.parent} by hand"
+    return f"check the connection; or fetch it elsewhere and put {download.wanted} into {download.part.parent} by hand"
 
 
 def _differs(download: _Download, found: str, expected: str) -> InputError:
@@ -225,11 +233,11 @@ def _extracted(download: _Download, known: KnownWeights) -> Path:
         ):
             found = _copied(member, stream, most)
     except (zipfile.BadZipFile, KeyError, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        path.unlink(missing_ok=True)
+        _forget(path, download.part)
         raise _differs(download, f"{type(error).__name__}: {error}", f"an archive with {known.member}") from error
     if found != known.sha256:
-        path.unlink()
-        raise _differs(download, f"{known.member} with sha256 {found}", known.sha256)
+        _forget(path, download.part)
+        raise _differs(download, f"{known.member} with sha256 {found}", f"sha256 {known.sha256}")
     return path
 
 
@@ -241,3 +249,8 @@ def _copied(source: IO[bytes], target: IO[bytes], most_bytes: int) -> str:
         target.write(block)
         left -= len(block)
     return state.hexdigest()
+
+
+def _forget(*paths: Path) -> None:
+    for path in paths:
+        path.unlink(missing_ok=True)

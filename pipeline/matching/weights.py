@@ -8,6 +8,7 @@ import os
 import pickle
 import re
 import struct
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -295,7 +296,10 @@ def _read_torch(found: FoundWeights, data: bytes) -> Any:
     import torch  # noqa: PLC0415 - takes seconds, and only networks need it
 
     try:
-        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            # They are about pickles of other kinds, which are refused.
+            warnings.simplefilter("ignore")
+            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except _DAMAGED as error:
         text = str(error)
         code = re.search(r"Unsupported (?:global|class|operand)\W+(?:GLOBAL )?([\w.]+)", text)

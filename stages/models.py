@@ -1,0 +1,173 @@
+"""models: the networks' weights: which there are, where they lie, fetched and verified."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.engine.errors import InputError, UsageError
+from pipeline.engine.progress import Reporter
+from pipeline.matching.known_weights import KNOWN, KnownWeights, matchers_of
+from pipeline.matching.weights import (
+    CONFIGURED,
+    VARIABLE,
+    FoundWeights,
+    all_weights,
+    cache_folder,
+    check_weights,
+    identified,
+    no_such_file,
+    weight_places,
+)
+
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, help="Weights of the networks.")
+
+
+@app.command("list")
+def show(as_json: AsJson = False) -> None:
+    """Tells which weights are known, and where they lie."""
+    paths: dict[str, Path] = {}
+    for found in all_weights():
+        if found.known:
+            paths.setdefault(found.known.file, found.path)
+    places = weight_places()
+    if as_json:
+        files = [_described(known, paths.get(known.file)) for known in KNOWN]
+        looked = [{"folder": str(place.path), "origin": place.origin} for place in places]
+        typer.echo(json.dumps({"looked_in": looked, "files": files}))
+        return
+    for network in dict.fromkeys(known.network for known in KNOWN):
+        typer.echo(f"{network}  (matchers: {', '.join(matchers_of(network))})")
+        for known in (known for known in KNOWN if known.network == network):
+            _tell(known, paths.get(known.file))
+    typer.echo("looked in")
+    for place in places:
+        typer.echo(f"  {place}")
+    typer.echo(f"and in what ${VARIABLE} and {CONFIGURED} name")
+
+
+def _described(known: KnownWeights, path: Path | None) -> dict[str, object]:
+    return {
+        "network": known.network,
+        "file": known.file,
+        "matchers": matchers_of(known.network),
+        "found": str(path) if path else None,
+        "bytes": known.size_bytes,
+        "licence": known.licence,
+        "source": known.source,
+        "url": known.url,
+        "member": known.member,
+        "sha256": known.sha256,
+        "note": known.note,
+    }
+
+
+def _tell(known: KnownWeights, path: Path | None) -> None:
+    size = f"{known.size_bytes / 1e6:.1f} MB" if known.size_bytes else ""
+    typer.echo(f"  {known.file:<42}{size:<9}{known.licence:<14}{path or 'missing'}")
+    typer.echo(f"    from    {known.source}{f'; {known.note}' if known.note else ''}")
+    member = f", {known.member} in it" if known.member else ""
+    typer.echo(
+        f"    address {known.url}{member}" if known.url else "    address none: put the file into a folder by hand"
+    )
+    typer.echo(f"    sha256  {known.sha256}")
+
+
+@app.command()
+def fetch(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NETWORK|FILE", help="A network's preferred file, or a file.")
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Every file that has an address.")] = False,
+    to: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", file_okay=False, help="Where to; the user's cache by default.")
+    ] = None,
+) -> None:
+    """Fetches weights, and keeps what has the right digest."""
+    from pipeline.matching.fetching import fetch as fetch_files  # noqa: PLC0415 - slow, and needed here only
+
+    if bool(names) == everything:
+        raise UsageError("E-WEIGHTS-10", "name networks or files, or --all", expected=_choices())
+    wanted = [known for known in KNOWN if known.url] if everything else [_wanted(name) for name in names or ()]
+    folder = to or cache_folder()
+    for fetched in fetch_files(wanted, folder, Reporter(sys.stderr)):
+        typer.echo(f"{fetched.path}: {'fetched, ' if fetched.fresh else 'already there, '}sha256 verified")
+    if folder.resolve() not in {place.path.resolve() for place in weight_places()}:
+        sys.stderr.write(f"not a place that is looked in by itself: state --set {CONFIGURED}={folder}\n")
+
+
+def _wanted(name: str) -> KnownWeights:
+    named = [known for known in KNOWN if name in {known.network, known.file}]
+    for known in named:
+        if known.url:
+            return known
+    if named:
+        raise UsageError(
+            "E-WEIGHTS-10",
+            f"{name} has no address to fetch it from",
+            found=named[0].source,
+            hint=f"put it into {cache_folder()}, or name its folder: --set {CONFIGURED}=FOLDER",
+        )
+    raise UsageError("E-WEIGHTS-10", f"no network or file {name}", expected=_choices())
+
+
+def _choices() -> str:
+    networks = dict.fromkeys(known.network for known in KNOWN)
+    return f"{', '.join(networks)}, or a file of theirs (epitransfer models list)"
+
+
+@app.command()
+def verify(
+    files: Annotated[
+        list[str] | None, typer.Argument(metavar="FILE[#sha256=HEX]", help="All that are found, by default.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compares weights with their digests; exit code 3 if one differs."""
+    found = _named(files) if files else all_weights()
+    errors = [_error(entry) for entry in found]
+    if as_json:
+        rows = [_judged(entry, error) for entry, error in zip(found, errors, strict=True)]
+        typer.echo(json.dumps({"files": rows}))
+    else:
+        for entry, error in zip(found, errors, strict=True):
+            typer.echo(f"{'differs' if error else 'ok':<9}{entry.path}")
+        if not found:
+            typer.echo(f"nothing to verify: no known weights in {', '.join(map(str, weight_places()))}")
+    _raise_first(errors)
+
+
+def _named(files: Sequence[str]) -> list[FoundWeights]:
+    # Named files are read as the configuration's are.
+    named = [place for place in weight_places(files) if place.origin == CONFIGURED]
+    for place in named:
+        if not place.path.is_file():
+            raise no_such_file(place.path)
+    return [identified(place.path, place.sha256) for place in named]
+
+
+def _error(found: FoundWeights) -> InputError | None:
+    try:
+        check_weights(found, found.path.read_bytes())
+    except InputError as error:
+        return error
+    return None
+
+
+def _judged(found: FoundWeights, error: InputError | None) -> dict[str, object]:
+    known = found.known.file if found.known else None
+    told = {"found": error.found, "expected": error.expected} if error else {}
+    return {"path": str(found.path), "network": found.network or None, "known_as": known, "ok": error is None, **told}
+
+
+def _raise_first(errors: Iterable[InputError | None]) -> None:
+    for error in errors:
+        if error:
+            raise error

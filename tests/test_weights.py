@@ -154,11 +154,12 @@ def test_a_named_file_serves_the_network_its_name_tells(tmp_path: Path, cache: P
     assert find_weights("lighterglue", configured) == FoundWeights(glue, "lighterglue", digest, None)
     # A RAFT's name need not tell its size; a name that tells nothing serves what is asked for.
     raft, mine = put(tmp_path / "raft-mine.pth"), put(tmp_path / "mine.pth", b"z")
-    assert find_weights(("raft-small", "raft-large"), str(raft)) == FoundWeights(raft, "", "", None)
-    assert find_weights("xfeat", str(mine)) == FoundWeights(mine, "xfeat", "", None)
-    # One that is for another network is passed by.
+    of_raft = f"{raft}#sha256={digest}"
+    assert find_weights(("raft-small", "raft-large"), of_raft) == FoundWeights(raft, "", digest, None)
+    assert find_weights("xfeat", f"{mine}#sha256={digest}") == FoundWeights(mine, "xfeat", digest, None)
+    # One that is for another network is passed by, even where nobody knows what it is.
     in_cache = put(cache / "xfeat.pt")
-    assert find_weights("xfeat", str(raft)).path == in_cache
+    assert find_weights("xfeat", (of_raft, str(raft))).path == in_cache
 
 
 def test_a_known_name_is_held_to_its_digest_unless_another_is_stated(tmp_path: Path) -> None:
@@ -212,7 +213,10 @@ def test_a_changed_file_is_told_from_a_truncated_one(tmp_path: Path, data: bytes
 def test_an_unknown_file_tells_the_very_words_that_let_it_in(tmp_path: Path) -> None:
     torch.save({"a": torch.ones(2)}, tmp_path / "mine.pt")
     with pytest.raises(InputError, match="E-WEIGHTS-06") as caught:
-        load_state(find_weights("xfeat", str(tmp_path / "mine.pt")))
+        find_weights("xfeat", str(tmp_path / "mine.pt"))
+    with pytest.raises(InputError, match="E-WEIGHTS-06"):
+        load_state(FoundWeights(tmp_path / "mine.pt", "xfeat", "", None))
+    assert weight_files(["xfeat"], str(tmp_path / "mine.pt")) == [tmp_path / "mine.pt"]
     (value,) = re.findall(r"--set match\.weights=(\S+)", caught.value.hint)
     assert torch.equal(load_state(find_weights("xfeat", value))["a"], torch.ones(2))
 

@@ -121,7 +121,8 @@ def find_weights(networks: str | Sequence[str], configured: Configured = ()) -> 
         configured: The value of `match.weights`.
 
     Raises:
-        InputError: The configuration names a file or folder that does not exist.
+        InputError: The configuration names a file or folder that does not exist, or a file that is no known one and
+            whose digest it does not state.
         MissingPartError: No file of these networks is in any of the places.
     """
     wanted = _as_tuple(networks)
@@ -130,6 +131,8 @@ def find_weights(networks: str | Sequence[str], configured: Configured = ()) -> 
         if place.origin == CONFIGURED and not place.path.exists():
             raise no_such_file(place.path, where=CONFIGURED)
         for found in _in_place(place, wanted):
+            if not found.sha256:
+                raise _of_unknown_origin(found, digest_file(found.path))
             return found
     files = [known for known in KNOWN if known.network in wanted]
     fetchable = [known.network for known in files if known.url]
@@ -236,14 +239,7 @@ def check_weights(found: FoundWeights, data: bytes) -> None:
     """
     digest = hashlib.sha256(data).hexdigest()
     if not found.sha256:
-        raise InputError(
-            "E-WEIGHTS-06",
-            "weights of unknown origin are not loaded unless their digest is stated",
-            where=str(found.path),
-            found=f"sha256 {digest}, which is no known file's",
-            expected=" or ".join(known.file for known in KNOWN if known.network == found.network),
-            hint=f"if you trust the file: --set {CONFIGURED}={found.path}{_STATED}{digest}",
-        )
+        raise _of_unknown_origin(found, digest)
     if digest == found.sha256:
         return
     size = found.known.size_bytes if found.known else None
@@ -257,6 +253,17 @@ def check_weights(found: FoundWeights, data: bytes) -> None:
         found=f"{len(data)} bytes, sha256 {digest}",
         expected=(f"{size} bytes, " if size is not None else "") + f"sha256 {found.sha256}",
         hint=f"{again}if the file is your own: --set {CONFIGURED}={found.path}{_STATED}{digest}",
+    )
+
+
+def _of_unknown_origin(found: FoundWeights, digest: str) -> InputError:
+    return InputError(
+        "E-WEIGHTS-06",
+        "weights of unknown origin are not loaded unless their digest is stated",
+        where=str(found.path),
+        found=f"sha256 {digest}, which is no known file's",
+        expected="a known file (epitransfer models list), or a stated digest",
+        hint=f"if you trust the file: --set {CONFIGURED}={found.path}{_STATED}{digest}",
     )
 
 
@@ -380,7 +387,9 @@ def _keys(what: str, names: list[str]) -> str:
 
 
 def compute_device() -> str:
-    """What networks run on: the GPU's name, or "cpu only"."""
+    """What networks run on by themselves: the GPU's name, "mps", or "cpu only"."""
     import torch  # noqa: PLC0415 - as above
 
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu only"
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    return "mps" if torch.backends.mps.is_available() else "cpu only"

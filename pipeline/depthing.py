@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.transfer import (
     Depths,
@@ -46,7 +46,7 @@ class MatchedRays:
     Args:
         ref: (2, n) ideal image-plane coordinates in ref.
         src: (2, n) ideal image-plane coordinates in src.
-        noise: Covariance of both.
+        noise: Covariance of the matched positions: all of it in src, for the depth is that of the ref pixel as given.
     """
 
     ref: Floats
@@ -55,7 +55,7 @@ class MatchedRays:
 
     @classmethod
     def of(
-        cls, ref_px: Floats, src_px: Floats, ref_camera: Camera, src_camera: Camera, sigma: PixelSigma
+        cls, ref_px: Floats, src_px: Floats, ref_camera: Camera, src_camera: Camera, covariance: Floats
     ) -> MatchedRays:
         """Removes the lens distortion from pixels and from their noise.
 
@@ -64,20 +64,11 @@ class MatchedRays:
             src_px: (n, 2) pixels as given.
             ref_camera: Camera of ref.
             src_camera: Camera of src.
-            sigma: Of the pixels.
+            covariance: (n, 3) px^2 of the src pixels, ref's taken as given: uu, uv, vv.
         """
         ref, src = ref_camera.rays(ref_px), src_camera.rays(src_px)
-        noise = PixelNoise(_noise(ref_camera, ref, sigma.of(ref_camera)), _noise(src_camera, src, sigma.of(src_camera)))
+        noise = PixelNoise(np.zeros(3), src_camera.plane_covariance(src, covariance))
         return cls(np.ascontiguousarray(ref[:, :2].T), np.ascontiguousarray(src[:, :2].T), noise)
-
-
-def _noise(camera: Camera, rays: Floats, sigma_px: float) -> Floats:
-    """(3, n) covariance xx, xy, yy on the image plane of isotropic pixel noise."""
-    a, b, c, d = (camera.pixel_jacobian(rays)[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-    determinant = a * d - b * c
-    scale = (sigma_px / determinant) ** 2
-    # The inverse of the Jacobian times its transpose.
-    return np.stack([(d * d + b * b) * scale, -(c * d + a * b) * scale, (a * a + c * c) * scale])
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +77,7 @@ class MethodDepths:
 
     Args:
         depths: With variance and normal.
+        pixel_sigma_m: (n,) the part of the depth's sigma that the matched positions have.
         parallax_rad: (n,).
         transfer_angle_rad: (n,).
         kept: (n,).
@@ -93,6 +85,7 @@ class MethodDepths:
     """
 
     depths: Depths
+    pixel_sigma_m: Floats
     parallax_rad: Floats
     transfer_angle_rad: Floats
     kept: Bools
@@ -125,7 +118,18 @@ def depths_by(
     with np.errstate(invalid="ignore"):
         # Where the view has no plane its normal is infinite, and the angle no number.
         angle = transfer_angle(rays.src, pose, found.normal)
-    return MethodDepths(found, parallax(rays.ref, rays.src, pose), angle, kept, reason)
+        pixels = _pixel_sigma(found, rays, pose)
+    return MethodDepths(found, pixels, parallax(rays.ref, rays.src, pose), angle, kept, reason)
+
+
+def _pixel_sigma(found: Depths, rays: MatchedRays, pose: RelativePose) -> Floats:
+    """How far one sigma of the src pixel moves the depth: by the normal, as any displacement of the src ray does."""
+    point = found.depth_m * np.concatenate([rays.ref, np.ones((1, found.depth_m.size))]) - pose.centre[:, None]
+    depth_in_src = pose.rotation[2] @ point
+    along_x, along_y = (found.normal @ pose.rotation[:2].T).T
+    xx, xy, yy = rays.noise.src
+    out: Floats = np.abs(depth_in_src) * np.sqrt(along_x * (along_x * xx + 2.0 * along_y * xy) + along_y * along_y * yy)
+    return out
 
 
 def _masked(found: Depths, rays: MatchedRays, pose: RelativePose, limits: Limits) -> tuple[Bools, AnyArray]:

@@ -4,7 +4,7 @@ from schemas._columns import TableSchema, flag, number, single, text
 
 DEPTHS = TableSchema(
     "depths",
-    1,
+    2,
     "Depths of the matches by every method.",
     (
         text("pair_id", "The pair in `pairs`."),
@@ -23,6 +23,13 @@ DEPTHS = TableSchema(
             nullable=True,
         ),
         number("sigma_depth_m", "m", "One sigma from pixel and pose covariance.", frame="ref RDF", nullable=True),
+        number(
+            "sigma_pixel_m",
+            "m",
+            "The part of sigma_depth_m that the matched positions have.",
+            frame="ref RDF",
+            nullable=True,
+        ),
         single("parallax_deg", "deg", "Angle between the two rays."),
         single(
             "transfer_angle_deg",

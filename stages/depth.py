@@ -19,7 +19,7 @@ from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import dataset, parquet_files, read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, relative_poses_of, selected_pairs
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.transfer import VirtualView
 from schemas import DEPTHS
@@ -46,7 +46,6 @@ class Config(StageConfig):
 @dataclass(frozen=True, slots=True)
 class _Setting:
     config: Config
-    sigma: PixelSigma
     pairs: Mapping[str, PairRow]
     cameras: Mapping[str, Camera]
     poses: Mapping[str, RelativePose]
@@ -56,7 +55,6 @@ def run(config: Config, context: Context) -> str:
     """Computes the depths of all inliers, part by part; writes `depths`."""
     setting = _Setting(
         config,
-        PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
         camera_by_frame(context.read("frames"), cameras_of(context.read("cameras"))),
         relative_poses_of(context.read("relative_poses")),
@@ -80,7 +78,8 @@ def _part(setting: _Setting, files: Sequence[Path]) -> pa.Table:
 def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
     pair, config = setting.pairs[pair_id], setting.config
     ref_px, src_px = columns(matches, ("ref_u", "ref_v")), columns(matches, ("src_u", "src_v"))
-    rays = MatchedRays.of(ref_px, src_px, setting.cameras[pair.ref], setting.cameras[pair.src], setting.sigma)
+    covariance = columns(matches, ("cov_uu", "cov_uv", "cov_vv"))
+    rays = MatchedRays.of(ref_px, src_px, setting.cameras[pair.ref], setting.cameras[pair.src], covariance)
     limits = Limits(config.max_relative_sigma, config.max_range_m)
     view = VirtualView(config.virtual_view)
     return [
@@ -111,6 +110,7 @@ def _table(pair: PairRow, ref_px: Floats, method: str, found: MethodDepths) -> p
             "method": [method] * n,
             "depth_m": known(found.depths.depth_m),
             "sigma_depth_m": known(np.sqrt(found.depths.variance_m2)),
+            "sigma_pixel_m": known(found.pixel_sigma_m),
             "parallax_deg": np.degrees(found.parallax_rad).astype(np.float32),
             "transfer_angle_deg": known(np.degrees(found.transfer_angle_rad).astype(np.float32)),
             "normal_x": known(normal[:, 0]),
@@ -140,10 +140,9 @@ def _summary(folder: Path, config: Config) -> str:
 
 STAGE = Stage(
     "depth",
-    1,
+    2,
     Config,
     ("frames", "cameras", "pairs", "matches", "relative_poses"),
     ("depths",),
     run,
-    reads=("match.sigma_px", "match.max_image_px"),
 )

@@ -20,7 +20,6 @@ from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, is_orthometric
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.geodesy.transform import FrameTransform
-from pipeline.geometry.cameras import PixelSigma
 from pipeline.points.geoparquet import TileFile, write_dataset
 from pipeline.points.observations import Scene, fused_tile, observations, spill
 from pipeline.points.stac import item
@@ -101,7 +100,6 @@ def _scene(context: Context) -> Scene:
         poses_of(context.read("poses")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
         _transform(context.setting, facts),
-        PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px")),
         context.setting("depth.methods")[0],
     )
 
@@ -119,12 +117,12 @@ def _merge(scene: Scene, config: Config, output: Path, folders: Sequence[Path]) 
 
 STAGE = Stage(
     "fuse",
-    1,
+    2,
     Config,
     ("frames", "cameras", "poses", "pairs", "depths", "images"),
     ("points",),
     run,
-    reads=("ingest.crs", "ingest.geoid", "depth.methods", "match.sigma_px", "match.max_image_px"),
+    reads=("ingest.crs", "ingest.geoid", "depth.methods"),
     facts_of=("ingest",),
     foresee=foresee,
 )

@@ -14,7 +14,7 @@ from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses_of, relative_pose_row, selected_pairs
 from pipeline.geometry.arrays import Floats
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, relative_pose
 from pipeline.matching.verify import epipolar_residuals
 from schemas import MATCHES, POSES, RELATIVE_POSES
@@ -31,17 +31,14 @@ def run(config: Config, context: Context) -> str:
     frames = context.read("frames")
     cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
     poses = poses_of(frames)
-    sigma = PixelSigma(context.setting("match.sigma_px"), context.setting("match.max_image_px"))
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
     found: dict[str, dict[str, object]] = {}
     for file in parquet_files(context.path("matches")):
         for pair_id, matches in by_pair(read_table(file, "matches")).items():
-            found[pair_id] = _row(pairs[pair_id], matches, poses, cameras, sigma, config.mode)
+            found[pair_id] = _row(pairs[pair_id], matches, poses, cameras, config.mode)
     # A pair without a single match has its row too.
     none = MATCHES.empty()
-    rows = [
-        found.get(pair_id) or _row(pair, none, poses, cameras, sigma, config.mode) for pair_id, pair in pairs.items()
-    ]
+    rows = [found.get(pair_id) or _row(pair, none, poses, cameras, config.mode) for pair_id, pair in pairs.items()]
     context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
     usable = frames.filter(frames.column("usable"))
     context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
@@ -75,7 +72,6 @@ def _row(
     matches: pa.Table,
     poses: Mapping[str, Pose],
     cameras: Mapping[str, Camera],
-    sigma: PixelSigma,
     mode: str,
 ) -> dict[str, object]:
     pose = relative_pose(poses[pair.ref], poses[pair.src])
@@ -83,10 +79,10 @@ def _row(
     residual: Floats = np.empty(0)
     if kept.num_rows:
         focal = cameras[pair.ref].focal_px
-        pixel_rad = sigma.of(cameras[pair.ref]) / focal
         ref = cameras[pair.ref].rays(columns(kept, ("ref_u", "ref_v")))
-        src = cameras[pair.src].rays(columns(kept, ("src_u", "src_v"))) @ pose.rotation
-        residual = np.abs(epipolar_residuals(ref, src, pose, pixel_rad).angle_rad) * focal
+        src = cameras[pair.src].rays(columns(kept, ("src_u", "src_v")))
+        noise = cameras[pair.src].plane_covariance(src, columns(kept, ("cov_uu", "cov_uv", "cov_vv")))
+        residual = np.abs(epipolar_residuals(ref, src @ pose.rotation, pose, noise).angle_rad) * focal
     rms = float(np.sqrt(np.mean(residual**2))) if residual.size else None
     return {
         **relative_pose_row(pair.pair_id, pose),
@@ -102,10 +98,9 @@ def _row(
 
 STAGE = Stage(
     "refine",
-    1,
+    2,
     Config,
     ("frames", "cameras", "pairs", "matches"),
     ("relative_poses", "poses"),
     run,
-    reads=("match.sigma_px", "match.max_image_px"),
 )

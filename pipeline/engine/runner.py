@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 
 from pipeline.engine.config import Configuration, is_path
 from pipeline.engine.digests import FileDigests, digest_json, digest_tree
-from pipeline.engine.errors import EpiTransferError, InputError
-from pipeline.engine.executors import Executor
+from pipeline.engine.errors import EpiTransferError, InputError, MissingPartError
+from pipeline.engine.executors import Executor, SerialExecutor
 from pipeline.engine.progress import Reporter
 from pipeline.engine.runfolder import DATASETS, RunFolder, output_name, tree_size, write_text
 from pipeline.engine.stage import Stage
@@ -87,7 +87,7 @@ def stage_slice(stage: Stage, folder: RunFolder, configuration: Configuration) -
         sources = stage.sources(config)
         if stage.place:
             parts["place of the sources"] = stage.place[1](config)
-    except InputError as error:
+    except (InputError, MissingPartError) as error:
         # Whether outputs are fresh can be asked without the sources at hand; running the stage tells what is missing.
         parts["sources"], sources = error.message, ()
     if sources:
@@ -293,12 +293,18 @@ class _StageContext:
         self.items = {"total": total, "failed": failed}
 
     def map(
-        self, function: Callable[[Sequence[Item]], Result], items: Iterable[Item], *, shard: int, label: str
+        self,
+        function: Callable[[Sequence[Item]], Result],
+        items: Iterable[Item],
+        *,
+        shard: int,
+        label: str,
+        here: bool = False,
     ) -> Iterator[Result]:
         listed = list(items)
         shards = list(_shards(listed, shard))
         with self.reporter.meter(self.stage.name, label, len(listed)) as meter:
-            for part, result in zip(shards, self.executor.map(function, shards), strict=True):
+            for part, result in zip(shards, self._executor(here).map(function, shards), strict=True):
                 meter.advance(len(part))
                 yield result
 
@@ -310,12 +316,16 @@ class _StageContext:
         *,
         shard: int,
         label: str,
+        here: bool = False,
     ) -> None:
         numbered = list(enumerate(_shards(list(items), shard)))
         job = partial(_write_part, self.output(name), name, function)
         with self.reporter.meter(self.stage.name, label, sum(len(part) for _, part in numbered)) as meter:
-            for (_, part), _done in zip(numbered, self.executor.map(job, numbered), strict=True):
+            for (_, part), _done in zip(numbered, self._executor(here).map(job, numbered), strict=True):
                 meter.advance(len(part))
+
+    def _executor(self, here: bool) -> Executor:
+        return SerialExecutor() if here else self.executor
 
 
 def _checked(name: str, table: pa.Table) -> pa.Table:

@@ -58,11 +58,18 @@ class Context(Protocol):
         """Tells how many items the stage had and how many became rows with a reason instead of a result."""
 
     def map(
-        self, function: Callable[[Sequence[Item]], Result], items: Iterable[Item], *, shard: int, label: str
+        self,
+        function: Callable[[Sequence[Item]], Result],
+        items: Iterable[Item],
+        *,
+        shard: int,
+        label: str,
+        here: bool = False,
     ) -> Iterator[Result]:
         """Applies a picklable function to shards of items, in parallel, results in order.
 
-        Progress is shown per item. The results do not depend on the number of processes.
+        Progress is shown per item. The results do not depend on the number of processes. With `here` it runs in this
+        process alone: for work that a device does, not the cores.
         """
 
     def map_tables(
@@ -73,6 +80,7 @@ class Context(Protocol):
         *,
         shard: int,
         label: str,
+        here: bool = False,
     ) -> None:
         """As `map`, each shard's table written as one part of the output dataset `name`.
 

@@ -139,6 +139,31 @@ class Camera:
         out: Floats = jacobian * np.array([[self.fx], [self.fy]])
         return out
 
+    def plane_covariance(self, rays: Floats, covariance: Floats) -> Floats:
+        """Covariance of pixels as that of the ideal image-plane coordinates.
+
+        Args:
+            rays: (n, 3) with z = 1.
+            covariance: (n, 3) px^2: uu, uv, vv.
+
+        Returns:
+            (3, n): xx, xy, yy.
+        """
+        jacobian = self.pixel_jacobian(rays)
+        a, b, c, d = (jacobian[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+        uu, uv, vv = np.asarray(covariance, np.float64).T
+        # J^-1 C J^-T, with J^-1 = [[d, -b], [-c, a]] / det.
+        return (
+            np.stack(
+                [
+                    d * d * uu - 2.0 * b * d * uv + b * b * vv,
+                    (a * d + b * c) * uv - c * d * uu - a * b * vv,
+                    c * c * uu - 2.0 * a * c * uv + a * a * vv,
+                ]
+            )
+            / (a * d - b * c) ** 2
+        )
+
     def holds(self, pixels: Floats) -> Bools:
         """Whether pixels lie in the image; one that is no number does not.
 

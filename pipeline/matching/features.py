@@ -5,15 +5,25 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
 
-from pipeline.geometry.arrays import Bytes, Floats
+from pipeline.geometry.arrays import AnyArray, Bytes, Floats, Ints, Singles
 from pipeline.matching.images import read_grey, shrunk_size, to_full_pixels
+from pipeline.matching.tiles import tiles
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Of the pieces that an image too large for one is cut into: wider than what a feature looks at.
+TILE_PX, TILE_MARGIN_PX = 2560, 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,58 +31,138 @@ class Features:
     """Features of an image.
 
     Args:
-        pixels: (n, 2) px of the image as given.
-        descriptors: (n, d) uint8; RootSIFT is the square root of their L1-normalised values.
+        pixels: (n, 2) px.
+        descriptors: (n, d), of the kind the extractor makes.
+        strength: (n,) the detector's response.
+        scale: (n,) px of the image per unit of the extractor's own pixels.
     """
 
     pixels: Floats
-    descriptors: Bytes
+    descriptors: AnyArray
+    strength: Singles
+    scale: Singles
+
+    @classmethod
+    def none(cls) -> Features:
+        """Of an image without any."""
+        return cls(np.empty((0, 2)), np.empty((0, 0), np.float32), np.empty(0, np.float32), np.empty(0, np.float32))
+
+    def take(self, rows: Ints) -> Features:
+        """Some of them, in the order of `rows`."""
+        return Features(self.pixels[rows], self.descriptors[rows], self.strength[rows], self.scale[rows])
 
 
 class Extractor(Protocol):
-    """Finds features in one image."""
+    """Finds features in images."""
 
     @property
     def settings(self) -> str:
         """All that the result depends on besides the image, as text."""
 
-    def extract(self, grey: Bytes) -> Features:
-        """Features of a grey image (height, width)."""
-
-
-@dataclass(frozen=True, slots=True)
-class SiftExtractor:
-    """SIFT, the strongest features first.
-
-    Args:
-        max_image_px: Longest side the image is matched at.
-        max_features: Most features kept.
-        contrast: Detection threshold.
-    """
-
-    max_image_px: int
-    max_features: int = 8192
-    contrast: float = 0.02
+    @property
+    def max_image_px(self) -> int:
+        """Longest side an image is looked at."""
 
     @property
-    def settings(self) -> str:
-        """As `Extractor.settings`."""
-        return f"sift-4 {cv2.__version__} {self.max_image_px} {self.max_features} {self.contrast}"
+    def max_features(self) -> int:
+        """Most features kept of an image."""
 
-    def extract(self, grey: Bytes) -> Features:
-        """As `Extractor.extract`."""
-        height, width = grey.shape
-        size = shrunk_size(width, height, self.max_image_px)
-        small = grey if size == (width, height) else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
-        detector = cv2.SIFT.create(
-            nfeatures=self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True
+    @property
+    def batch(self) -> int:
+        """How many images are best looked at together."""
+
+    def detect(self, pieces: Sequence[Bytes]) -> list[Features]:
+        """Features of grey images (height, width) of one size, in their pixels; at most `max_features` of each."""
+
+
+def extract(extractor: Extractor, images: Sequence[Bytes]) -> list[Features]:
+    """Features of grey images, shrunk and in pieces as need be; the strongest are kept.
+
+    Args:
+        extractor: Finds them.
+        images: (height, width) each.
+
+    Returns:
+        Of each image, in its pixels as given.
+    """
+    found: list[list[Features]] = [[] for _ in images]
+    by_size: dict[tuple[int, ...], list[tuple[int, Bytes, tuple[int, int], Callable[[Floats], AnyArray]]]] = {}
+    sizes = []
+    for index, image in enumerate(images):
+        height, width = image.shape
+        size = shrunk_size(width, height, extractor.max_image_px)
+        sizes.append((size, (width, height)))
+        resized = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        small = np.asarray(resized, np.uint8)
+        for tile in tiles(*size, TILE_PX, TILE_MARGIN_PX):
+            piece = tile.cut(small)
+            by_size.setdefault(piece.shape, []).append((index, piece, (tile.left, tile.top), tile.owns))
+    for pieces in by_size.values():
+        for (index, _, corner, owns), features in zip(
+            pieces, extractor.detect([piece for _, piece, _, _ in pieces]), strict=True
+        ):
+            placed = Features(features.pixels + corner, features.descriptors, features.strength, features.scale)
+            found[index].append(placed.take(np.flatnonzero(owns(placed.pixels))))
+    return [
+        _in_full(_strongest(parts, extractor.max_features), *size) for parts, size in zip(found, sizes, strict=True)
+    ]
+
+
+def _strongest(parts: Sequence[Features], most: int) -> Features:
+    full = [part for part in parts if len(part.pixels)]
+    if not full:
+        return Features.none()
+    if len(full) == 1:
+        return full[0]
+    joined = Features(
+        *(
+            np.concatenate([getattr(part, name) for part in full])
+            for name in ("pixels", "descriptors", "strength", "scale")
         )
-        keypoints, descriptors = detector.detectAndCompute(np.asarray(small, np.uint8), None)
-        if descriptors is None or not keypoints:
-            return Features(np.empty((0, 2)), np.empty((0, 128), np.uint8))
-        pixels = np.array([point.pt for point in keypoints], np.float64)
-        return Features(to_full_pixels(pixels, size, (width, height)), descriptors.astype(np.uint8))
+    )
+    return joined.take(np.argsort(-joined.strength, kind="stable")[:most])
+
+
+def _in_full(features: Features, shrunk: tuple[int, int], full: tuple[int, int]) -> Features:
+    factor = np.float32(full[0] / shrunk[0])
+    pixels = to_full_pixels(features.pixels, shrunk, full)
+    return Features(pixels, features.descriptors, features.strength, features.scale * factor)
+
+
+def ahead(make: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Results in order, the next ones made in another thread while the caller works on the last one.
+
+    Args:
+        make: From item to result; decoding an image leaves the interpreter to others.
+        items: What to make them from.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        source = iter(items)
+        waiting = [pool.submit(make, item) for item in islice(source, 2)]
+        while waiting:
+            result = waiting.pop(0).result()
+            waiting += [pool.submit(make, item) for item in islice(source, 1)]
+            yield result
+
+
+def store_features(sources: Sequence[tuple[Path | str, str]], extractor: Extractor, cache: Path) -> None:
+    """Extracts and keeps the features of images that are not in the cache.
+
+    Args:
+        sources: Image file or URL, and the SHA-256 of its bytes.
+        extractor: Finds the features.
+        cache: Folder of cached features.
+
+    Raises:
+        InputError: An image cannot be read.
+    """
+    missing = [source for source in sources if _stored(_file(source[1], extractor, cache)) is None]
+    decoded = ahead(read_grey, [path for path, _ in missing])
+    for start in range(0, len(missing), extractor.batch):
+        part = missing[start : start + extractor.batch]
+        images = list(islice(decoded, len(part)))
+        for (_, digest), features in zip(part, extract(extractor, images), strict=True):
+            _store(features, _file(digest, extractor, cache))
 
 
 def cached_features(path: Path | str, digest: str, extractor: Extractor, cache: Path) -> Features:
@@ -87,23 +177,43 @@ def cached_features(path: Path | str, digest: str, extractor: Extractor, cache: 
     Raises:
         InputError: The image cannot be read.
     """
+    file = _file(digest, extractor, cache)
+    features = _stored(file)
+    if features is None:
+        features = extract(extractor, [read_grey(path)])[0]
+        _store(features, file)
+    return features
+
+
+def _file(digest: str, extractor: Extractor, cache: Path) -> Path:
     name = hashlib.sha256(f"{digest} {extractor.settings}".encode()).hexdigest()
-    file = cache / "features" / name[:2] / f"{name}.npz"
+    return cache / "features" / name[:2] / f"{name}.npz"
+
+
+def _stored(file: Path) -> Features | None:
     try:
         with np.load(file, allow_pickle=False) as stored:
-            return Features(stored["pixels"], stored["descriptors"])
+            return Features(stored["pixels"], stored["descriptors"], stored["strength"], stored["scale"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        # Absent, or cut short by a full disk or a kill: made again.
-        features = extractor.extract(read_grey(path))
+        # Absent, or cut short by a full disk or a kill: to be made again.
+        return None
+
+
+def _store(features: Features, file: Path) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     # A name of its own: two photos of the same bytes may be worked on at once.
     with tempfile.NamedTemporaryFile(dir=file.parent, prefix=".", suffix=".tmp", delete=False) as stream:
         temporary = Path(stream.name)
         try:
-            np.savez(stream, pixels=features.pixels, descriptors=features.descriptors)
+            np.savez(
+                stream,
+                pixels=features.pixels,
+                descriptors=features.descriptors,
+                strength=features.strength,
+                scale=features.scale,
+            )
             stream.flush()
             temporary.replace(file)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-    return features

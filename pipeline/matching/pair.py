@@ -1,4 +1,8 @@
-"""Matches of one pair: guided search, duplicates, the logged pose's own error, and the pair's consensus."""
+"""Matches of one pair: candidates, duplicates, the fit of their patches, the logged pose's error, the consensus.
+
+The fit of the patches both finds the position to a fraction of a pixel and tells right from wrong: where no affine
+warp makes the patches alike the match is none, whatever the descriptors say.
+"""
 
 from __future__ import annotations
 
@@ -6,46 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Bools, Floats, Singles
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.features import Features
-from pipeline.matching.guided import Band, epipolar_angles, match_guided, rays_in_ref
+from pipeline.matching.matcher import Matcher, SearchLimits, View
+from pipeline.matching.reach import rays_in_ref
+from pipeline.matching.subpixel import PatchSetting, Refined, refine
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
-
-
-@dataclass(frozen=True, slots=True)
-class PairImage:
-    """One image of a pair.
-
-    Args:
-        features: Its features.
-        camera: Its camera.
-    """
-
-    features: Features
-    camera: Camera
-
-
-@dataclass(frozen=True, slots=True)
-class SearchLimits:
-    """Limits of the search.
-
-    Args:
-        band: Of the epipolar search.
-        ratio: Largest ratio of best to second-best distance.
-        consensus_px: Largest residual from the pair's own epipolar geometry.
-        max_image_px: Longest side images are matched at; the limits in pixels are at that size.
-    """
-
-    band: Band
-    ratio: float
-    consensus_px: float
-    max_image_px: int
-
-    def pixel_rad(self, camera: Camera) -> float:
-        """The angle of one pixel at the size an image is matched at."""
-        return PixelSigma(1.0, self.max_image_px).of(camera) / camera.focal_px
+from pipeline.matching.warps import predicted_affines
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,69 +26,89 @@ class PairMatches:
     Args:
         ref_px: (n, 2) pixels of the ref image as given.
         src_px: (n, 2) pixels of the src image as given.
-        score: (n,) higher is better.
-        inlier: (n,) agrees with the pose within its error and with the pair's consensus.
+        score: (n,) the matcher's own, 0 to 1.
+        covariance: (n, 3) px^2 of the src position, ref's taken as given: uu, uv, vv.
+        inlier: (n,) its patches fit, and it agrees with the pose within its error and with the pair's consensus.
     """
 
     ref_px: Floats
     src_px: Floats
     score: Floats
+    covariance: Floats
     inlier: Bools
 
 
-def match_pair(ref: PairImage, src: PairImage, pose: RelativePose, limits: SearchLimits) -> PairMatches:
+def match_pair(
+    matcher: Matcher,
+    ref: View,
+    src: View,
+    pose: RelativePose,
+    limits: SearchLimits,
+    *,
+    up_in_ref: Floats | None = None,
+    subpixel: bool = True,
+) -> PairMatches:
     """Matches two images under a pose with known covariance.
 
     Args:
+        matcher: Makes the candidates.
         ref: The image that gets the depth.
         src: The other.
         pose: src_from_ref with its covariance.
         limits: Of the search.
+        up_in_ref: (3,) the vertical on the ref camera's axes; level ground is then one guess at a patch's surface.
+        subpixel: Whether the matches of a sparse matcher are moved to where their patches fit, or refused.
     """
-    ref_rays = rays_in_ref(ref.features.pixels, ref.camera, np.eye(3))
-    src_rays = rays_in_ref(src.features.pixels, src.camera, pose.rotation.T)
-    found = match_guided(
-        root_sift(ref.features),
-        root_sift(src.features),
-        epipolar_angles(ref_rays, pose, limits.band, limits.pixel_rad(ref.camera)),
-        epipolar_angles(src_rays, pose, limits.band, limits.pixel_rad(src.camera)),
-        max_parallax_rad=_max_parallax(pose, limits.band.nearest_for(pose)),
-        ratio=limits.ratio,
+    made = matcher.candidates(ref, src, pose, limits)
+    keep = without_duplicates(made.ref_px, made.src_px, made.score)
+    ref_px, src_px, variance = made.ref_px[keep], made.src_px[keep], made.variance_px2[keep]
+    covariance = np.stack([variance, np.zeros_like(variance), variance], axis=1)
+    good = np.ones(len(ref_px), np.bool_)
+    if subpixel and matcher.extractor is not None:
+        fitted = _fitted(ref_px, src_px, ref, src, pose, limits, up_in_ref)
+        good = fitted.refined
+        src_px[good], covariance[good] = fitted.src_px[good], fitted.covariance[good]
+    good[good] = _agreeing(ref_px[good], src_px[good], covariance[good], ref, src, pose, limits)
+    return PairMatches(ref_px, src_px, made.score[keep], covariance, good)
+
+
+def _fitted(
+    ref_px: Floats,
+    src_px: Floats,
+    ref: View,
+    src: View,
+    pose: RelativePose,
+    limits: SearchLimits,
+    up_in_ref: Floats | None,
+) -> Refined:
+    warps = predicted_affines(ref_px, src_px, ref.camera, src.camera, pose, up_in_ref=up_in_ref)
+    return refine(ref.image, src.image, ref_px, src_px, warps, PatchSetting(limits.max_image_px))
+
+
+def _agreeing(
+    ref_px: Floats,
+    src_px: Floats,
+    covariance: Floats,
+    ref: View,
+    src: View,
+    pose: RelativePose,
+    limits: SearchLimits,
+) -> Bools:
+    """Which matches agree with the pose within its error, and then with one another."""
+    ref_ray = rays_in_ref(ref_px, ref.camera, np.eye(3))
+    src_ray = rays_in_ref(src_px, src.camera, pose.rotation.T)
+    in_src = src_ray @ pose.rotation.T
+    noise = src.camera.plane_covariance(in_src / in_src[:, 2:], covariance)
+    residual = epipolar_residuals(ref_ray, src_ray, pose, noise)
+    inlier: Bools = np.abs(residual.angle_rad) <= limits.band.sigmas * residual.sigma_rad
+    inlier[inlier] = consensus(
+        image_plane(ref_ray[inlier]),
+        image_plane(in_src[inlier]),
+        limits.consensus_px * limits.pixel_rad(ref.camera),
     )
-    ref_px, src_px = ref.features.pixels[found.ref], src.features.pixels[found.src]
-    keep = without_duplicates(ref_px, src_px, found.score)
-    ref_px, src_px, score = ref_px[keep], src_px[keep], found.score[keep]
-    ref_ray, src_ray = ref_rays[found.ref[keep]], src_rays[found.src[keep]]
-    pixel_rad = limits.pixel_rad(ref.camera)
-    residual = epipolar_residuals(ref_ray, src_ray, pose, limits.band.sigma_px * pixel_rad)
-    inlier = np.abs(residual.angle_rad) <= limits.band.sigmas * residual.sigma_rad
-    agreeing = consensus(
-        ref_ray[inlier, :2] / ref_ray[inlier, 2:],
-        image_plane(src_ray[inlier] @ pose.rotation.T),
-        limits.consensus_px * pixel_rad,
-    )
-    inlier[inlier] = agreeing
-    return PairMatches(ref_px, src_px, score, inlier)
+    return inlier
 
 
 def image_plane(rays: Floats) -> Floats:
     """(n, 2) coordinates at z = 1 of (n, 3) rays."""
     return rays[:, :2] / rays[:, 2:]
-
-
-def root_sift(features: Features) -> Singles:
-    """Unit descriptors: the square root of the L1-normalised ones (Arandjelovic and Zisserman, CVPR 2012).
-
-    Returns:
-        (n, d) float32.
-    """
-    values = features.descriptors.astype(np.float32)
-    total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1e-12))
-    out: Singles = np.sqrt(values / total)
-    return out
-
-
-def _max_parallax(pose: RelativePose, nearest_m: float) -> float:
-    """The largest turn of a ray between the two centres for points no nearer than a range."""
-    length = float(np.linalg.norm(pose.centre))
-    return float(2.0 * np.arcsin(min(1.0, 0.5 * length / nearest_m)))

@@ -51,14 +51,14 @@ def without_duplicates(ref_px: Floats, src_px: Floats, score: Floats) -> Bools:
     return keep
 
 
-def epipolar_residuals(ref_rays: Floats, src_rays: Floats, pose: RelativePose, pixel_rad: float) -> Residuals:
+def epipolar_residuals(ref_rays: Floats, src_rays: Floats, pose: RelativePose, noise: Floats) -> Residuals:
     """The angle between each src ray and the plane of its ref ray and the baseline.
 
     Args:
         ref_rays: (n, 3) in the ref camera frame.
         src_rays: (n, 3) on the ref camera's axes.
         pose: src_from_ref with its covariance.
-        pixel_rad: One sigma of a feature's direction.
+        noise: (3, n) covariance xx, xy, yy of the matched positions, all of it on src's image plane (z = 1).
     """
     centre = pose.centre
     plane = np.cross(centre, ref_rays)
@@ -67,8 +67,18 @@ def epipolar_residuals(ref_rays: Floats, src_rays: Floats, pose: RelativePose, p
     angle = np.arcsin(np.clip(np.sum(plane * unit, axis=1), -1.0, 1.0))
     range_m = _ranges(ref_rays, unit, centre)
     jacobian = np.concatenate([np.cross(unit, plane), plane / range_m[:, None]], axis=1)
-    variance = np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian) + 2.0 * pixel_rad**2
+    variance = np.einsum("ni,ij,nj->n", jacobian, pose.covariance, jacobian) + _across(unit, plane, pose, noise)
     return Residuals(angle, np.sqrt(variance))
+
+
+def _across(unit: Floats, plane: Floats, pose: RelativePose, noise: Floats) -> Floats:
+    """Variance (rad^2) of unit src rays across their epipolar planes by the noise of their pixels."""
+    ray, normal = unit @ pose.rotation.T, plane @ pose.rotation.T
+    # The ray (x, y, 1) / length turns by (I - r r^T) / length per unit of x and y.
+    across = ray[:, 2, None] * (normal[:, :2] - np.sum(normal * ray, axis=1, keepdims=True) * ray[:, :2])
+    xx, xy, yy = noise
+    out: Floats = across[:, 0] * (across[:, 0] * xx + 2.0 * across[:, 1] * xy) + across[:, 1] ** 2 * yy
+    return out
 
 
 def _ranges(ref_rays: Floats, src_unit: Floats, centre: Floats) -> Floats:

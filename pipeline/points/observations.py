@@ -14,7 +14,7 @@ from pyarrow import feather
 from pipeline.flight import PairRow, column, columns
 from pipeline.geodesy.transform import FrameTransform
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose
 from pipeline.matching.images import read_colour
 from pipeline.points.geoparquet import tile_table
@@ -36,7 +36,6 @@ class Scene:
         poses: Pose of each frame.
         pairs: The pairs by name.
         transform: From ENU to the output CRS.
-        sigma: Of the matched positions.
         method: The method whose points are published.
     """
 
@@ -46,7 +45,6 @@ class Scene:
     poses: Mapping[str, Pose]
     pairs: Mapping[str, PairRow]
     transform: FrameTransform
-    sigma: PixelSigma
     method: str
 
 
@@ -79,11 +77,9 @@ def observations(scene: Scene, depths: pa.Table) -> pa.Table:
 def _of_pair(scene: Scene, pair: PairRow, rows: pa.Table, picture: Bytes) -> pa.Table:
     pixels, depth = columns(rows, ("u", "v")), np.asarray(column(rows, "depth_m"), np.float64)
     normal = columns(rows, ("normal_x", "normal_y", "normal_z"))
-    ref, src = (
-        Shot(scene.cameras[frame], scene.poses[frame], scene.sigma.of(scene.cameras[frame]))
-        for frame in (pair.ref, pair.src)
-    )
-    points = world_points(pixels, depth, normal, ref, src)
+    pixel_sigma = np.asarray(column(rows, "sigma_pixel_m"), np.float64)
+    ref, src = (Shot(scene.cameras[frame], scene.poses[frame]) for frame in (pair.ref, pair.src))
+    points = world_points(pixels, depth, normal, pixel_sigma, ref, src)
     # Convergence and scale hardly change over one frame's view: the Jacobian at its camera serves all its points.
     jacobian = scene.transform.jacobian(ref.pose.centre)
     own, common = (jacobian @ part @ jacobian.T for part in (points.own, points.common))

@@ -41,27 +41,27 @@ class Shot:
     Args:
         camera: Its camera.
         pose: Its pose.
-        sigma_px: One sigma of a matched position, per axis.
     """
 
     camera: Camera
     pose: Pose
-    sigma_px: float
 
 
-def world_points(ref_px: Floats, depth_m: Floats, normal: Floats, ref_shot: Shot, src_shot: Shot) -> WorldPoints:
+def world_points(
+    ref_px: Floats, depth_m: Floats, normal: Floats, pixel_sigma_m: Floats, ref_shot: Shot, src_shot: Shot
+) -> WorldPoints:
     """Points of one pair.
 
     Args:
         ref_px: (n, 2) pixels of ref as given.
         depth_m: (n,).
         normal: (n, 3) of the depth, on the ref camera's axes.
+        pixel_sigma_m: (n,) the depth's sigma by the matched positions alone; they move a point along its ref ray.
         ref_shot: The image that has the depth.
         src_shot: The other.
     """
     ref, src = ref_shot.pose, src_shot.pose
-    rays = ref_shot.camera.rays(ref_px)
-    v = rays @ ref.rotation.T
+    v = ref_shot.camera.rays(ref_px) @ ref.rotation.T
     p = depth_m[:, None] * v
     baseline = src.centre - ref.centre
     q = p - baseline
@@ -73,8 +73,7 @@ def world_points(ref_px: Floats, depth_m: Floats, normal: Floats, ref_shot: Shot
         + _spread(by_src * src.own.position_m)
         + _spread(turn_ref * ref.own.gimbal_rad)
         + _spread(turn_src * src.own.gimbal_rad)
-        + _spread(_by_pixels(by_ref, depth_m[:, None] * rays, ref_shot))
-        + _spread(_by_pixels(by_src, q @ src.rotation, src_shot))
+        + _spread((v * pixel_sigma_m[:, None])[:, :, None])
     )
     # What all frames share: the same shift, and the same error of yaw, pitch and roll in both.
     common = np.diag(ref.common.position_m**2) + _spread((turn_ref + turn_src) * ref.common.gimbal_rad)
@@ -83,18 +82,4 @@ def world_points(ref_px: Floats, depth_m: Floats, normal: Floats, ref_shot: Shot
 
 def _spread(jacobian: Floats) -> Floats:
     out: Floats = jacobian @ np.swapaxes(jacobian, -1, -2)
-    return out
-
-
-def _by_pixels(by_ray: Floats, points: Floats, shot: Shot) -> Floats:
-    """(n, 3, 2): how far one sigma of each pixel axis moves the point, by how the point moves with the ray at it.
-
-    Args:
-        by_ray: (n, 3, 3) in ENU.
-        points: (n, 3) m in the camera's frame.
-        shot: The image.
-    """
-    depth = points[:, 2, None]
-    on_plane = np.linalg.inv(shot.camera.pixel_jacobian(points / depth))
-    out: Floats = by_ray @ (shot.pose.rotation[:, :2] @ on_plane) * (depth * shot.sigma_px)[:, :, None]
     return out

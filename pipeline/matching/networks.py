@@ -1,0 +1,34 @@
+"""Building the matchers that need torch or optical flow."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from pipeline.matching.lighterglue import LighterGlueMatcher, LighterGlueNetwork
+from pipeline.matching.matcher import Matcher
+from pipeline.matching.xfeat import XFeatExtractor, XFeatMatcher, XFeatNetwork
+from pipeline.matching.xfeat_star import StarExtractor, StarMatcher
+
+if TYPE_CHECKING:
+    from pipeline.matching.matchers import MatcherSetting
+
+
+def build(setting: MatcherSetting, max_features: int, ratio: float, notes: list[str]) -> Matcher:
+    """A matcher on XFeat.
+
+    Args:
+        setting: With the name, the size images are matched at, the weights and the device.
+        max_features: Most features of an image.
+        ratio: Largest ratio of best to second-best distance.
+        notes: Where networks write what the user should be told.
+    """
+    device = torch.device(setting.device)
+    xfeat = XFeatNetwork(setting.weights[0], device, notes)
+    if setting.name == "xfeat-star":
+        return StarMatcher(StarExtractor(xfeat, setting.max_image_px, max_features), ratio)
+    extractor = XFeatExtractor(xfeat, setting.max_image_px, max_features)
+    if setting.name == "xfeat-lighterglue":
+        return LighterGlueMatcher(extractor, LighterGlueNetwork(setting.weights[1], device, notes))
+    return XFeatMatcher(extractor, ratio)

@@ -10,6 +10,7 @@ import typer
 from pipeline.engine.executors import usable_cores
 from pipeline.simulation.example import write_example
 from pipeline.simulation.indoor import write_indoor
+from pipeline.simulation.lawn import lawn_frames
 
 
 def command(
@@ -21,17 +22,25 @@ def command(
     ] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; all cores by default.")] = None,
 ) -> None:
-    """Writes a synthetic flight: photos with DJI tags, logs, LiDAR tiles, control points, the truth, and workflows."""
+    """Writes a synthetic flight: photos with DJI tags, logs, LiDAR tiles, control points, the truth, and workflows.
+
+    Beside it, in DIR/lawn, a second and shorter flight over ground of low texture: a lawn and a wide roof.
+    """
     if indoor:
         room = write_indoor(directory, seed, frames)
         typer.echo(f"{directory}: {room.frames} images, {room.sweeps} LiDAR sweeps, {room.returns} returns")
         typer.echo(f"next: epitransfer run {directory / 'workflow.toml'} --out RUN", err=True)
         return
     workers = jobs or usable_cores()
-    typer.echo(f"rendering {frames} photos on {workers} processors, some three seconds each", err=True)
+    typer.echo(
+        f"rendering {frames} photos, and {lawn_frames(frames)} over a lawn, on {workers} processors, "
+        "some three seconds each",
+        err=True,
+    )
     made = write_example(directory, frames, seed, workers)
     typer.echo(
         f"{made.directory}: {made.frames} photos, {made.lidar_points} LiDAR returns, "
         f"{made.control_observations} control point observations"
     )
+    typer.echo(f"{made.directory / 'lawn'}: {made.lawn_frames} photos of low texture, {made.lawn_points} LiDAR returns")
     typer.echo(f"next: epitransfer run {directory / 'workflow.toml'} --out RUN", err=True)

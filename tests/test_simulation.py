@@ -31,6 +31,7 @@ from pipeline.simulation.flight import (
     logged_poses,
     noisy_poses,
 )
+from pipeline.simulation.lawn import FEW_FRAMES
 from pipeline.simulation.render import CAMERA, Renderer, camera_rays, scene_depth
 from pipeline.simulation.shading import Shader
 from pipeline.simulation.site import GROUND, SKY, UNDULATION_M, Site
@@ -441,7 +442,9 @@ def test_bytes_do_not_depend_on_the_processes(tmp_path: Path) -> None:
     first, second = digests(tmp_path / "1"), digests(tmp_path / "2")
     assert first == second
     # Photos, bare photos but one, depth maps; tiles; lists and truth; camera; five workflows; six files of logs.
-    assert len(first) == 3 * FRAMES - 1 + 2 + 4 + 1 + 5 + 6
+    own = 3 * FRAMES - 1 + 2 + 4 + 1 + 5 + 6
+    # The lawn's photos and depth maps, tiles, truth and workflow.
+    assert len(first) == own + 2 * FEW_FRAMES + 2 + 2 + 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"], "nothing temporary is left"
 
 

@@ -1,4 +1,4 @@
-"""Writes the example: photos, logs, tiles, control points, the truth, and workflows that run them."""
+"""Writes the example: photos, logs, tiles, control points, the truth, workflows; a second flight over a lawn."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from pipeline.simulation.bare import CAMERA_FILE, camera_time_error, camera_yaml
 from pipeline.simulation.control import gcp_list, observe
 from pipeline.simulation.flight import CONSUMER_DRONE, FEWEST_FRAMES, Trajectory, fly, frame_id, logged_poses
 from pipeline.simulation.grid import COMPOUND_CRS, navd88_height
+from pipeline.simulation.lawn import fly_lawn, lawn_frames, lawn_seed, lawn_site
+from pipeline.simulation.lawn_looks import LawnShader
 from pipeline.simulation.photos import LoggedPose, save_bare, save_photo
 from pipeline.simulation.render import CAMERA, Renderer, camera_rays, exposed
 from pipeline.simulation.shading import Shader
@@ -40,6 +42,20 @@ geoid = {UNDULATION_M:.1f}
 crs = "{COMPOUND_CRS}"
 
 """
+_LAWN_FOLDER = "lawn"
+_LAWN_FILE = "workflow_lawn.toml"
+_LAWN_WORKFLOW = f"""\
+# A second, short flight over a lawn and a wide roof, on which there is little to match:
+#     epitransfer run {_LAWN_FILE} --out run_lawn
+# Heights in the photos are above NAVD 88, which lies {-UNDULATION_M:g} m above the ellipsoid here.
+
+[ingest]
+photos = "{_LAWN_FOLDER}/photos"
+height_datum = "navd88"
+geoid = {UNDULATION_M:.1f}
+crs = "{COMPOUND_CRS}"
+
+"""
 _STAGES = """\
 [pair]
 baseline_m = [3.0, 16.0]
@@ -56,7 +72,7 @@ methods = ["epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"]
 [fuse]
 
 [score]
-lidar = "lidar/*.laz"
+lidar = "{lidar}"
 """
 
 
@@ -69,23 +85,53 @@ class Summary:
         frames: Photos.
         lidar_points: Returns in the tiles.
         control_observations: Lines of the control point list.
+        lawn_frames: Photos of the second flight.
+        lawn_points: Returns in its tiles.
     """
 
     directory: Path
     frames: int
     lidar_points: int
     control_observations: int
+    lawn_frames: int
+    lawn_points: int
 
 
 @dataclass(frozen=True, slots=True)
-class _Share:
-    """The frames one process renders; it prepares its site and rays once."""
+class _Flight:
+    """What one of the two flights is made from.
+
+    Args:
+        folder: Where its photos and its truth go.
+        seed: Its own.
+        frames: Photos.
+        lawn: Whether it is the second one; it is written with tags alone, without the bare photos and the logs.
+    """
 
     folder: Path
     seed: int
     frames: int
+    lawn: bool
+
+    def scene(self) -> tuple[Site, Trajectory]:
+        """Its site and its true poses."""
+        if self.lawn:
+            site = lawn_site(self.seed)
+            return site, fly_lawn(site, self.frames)
+        site = Site.seeded(self.seed)
+        return site, fly(site.terrain, self.frames, self.seed)
+
+    def shader(self, site: Site) -> Shader:
+        """Its looks."""
+        return LawnShader.of(site) if self.lawn else Shader.of(site)
+
+
+@dataclass(frozen=True, slots=True)
+class _Share:
+    """The frames of each flight that one process renders; it prepares each site and the rays once."""
+
     camera: Camera
-    indices: tuple[int, ...]
+    frames: tuple[tuple[_Flight, tuple[int, ...]], ...]
 
 
 def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 1, camera: Camera = CAMERA) -> Summary:
@@ -112,12 +158,17 @@ def write_example(directory: Path, frames: int = 24, seed: int = 7, jobs: int = 
         beside = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
         try:
             beside.chmod(0o755)
-            shares = _shares(beside, frames, seed, jobs, camera)
-            observations, returns = _write(beside, shares)
+            flights = (
+                _Flight(beside, seed, frames, lawn=False),
+                _Flight(beside / _LAWN_FOLDER, lawn_seed(seed), lawn_frames(frames), lawn=True),
+            )
+            _render_all(flights, jobs, camera)
+            observations, returns = _write(flights[0], camera)
+            lawn_returns = _write_lawn(flights[1], camera)
             beside.rename(directory)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
-    return Summary(directory, frames, returns, observations)
+    return Summary(directory, frames, returns, observations, flights[1].frames, lawn_returns)
 
 
 def logged(site: Site, poses: Trajectory, index: int) -> LoggedPose:
@@ -194,54 +245,76 @@ def _explained(directory: Path) -> Iterator[None]:
         ) from error
 
 
-def _shares(folder: Path, frames: int, seed: int, jobs: int, camera: Camera) -> list[_Share]:
-    """Every `jobs`-th frame to the same process."""
-    count = min(jobs, frames)
-    return [_Share(folder, seed, frames, camera, tuple(range(first, frames, count))) for first in range(count)]
-
-
-def _write(folder: Path, shares: list[_Share]) -> tuple[int, int]:
-    """Writes everything; returns the numbers of control point observations and LiDAR returns."""
-    for name in ("photos", "bare", "logs", "lidar", "truth/depth"):
-        (folder / name).mkdir(parents=True)
+def _render_all(flights: tuple[_Flight, ...], jobs: int, camera: Camera) -> None:
+    """Renders every photo; every `jobs`-th frame of each flight goes to the same process."""
+    for flight in flights:
+        for name in ("photos", "lidar", "truth/depth", *(() if flight.lawn else ("bare", "logs"))):
+            (flight.folder / name).mkdir(parents=True)
+    count = min(jobs, max(flight.frames for flight in flights))
+    shares = [
+        _Share(camera, tuple((flight, tuple(range(first, flight.frames, count))) for flight in flights))
+        for first in range(count)
+    ]
     with executor_for(len(shares)) as executor:
         for _ in executor.map(_render, shares):
             pass
-    camera = shares[0].camera
-    site, true_poses = _scene(shares[0].seed, shares[0].frames)
+
+
+def _render(share: _Share) -> None:
+    rays = camera_rays(share.camera)
+    for flight, indices in share.frames:
+        if indices:
+            _render_some(flight, Renderer(share.camera, rays, flight.shader(flight.scene()[0])), indices)
+
+
+def _render_some(flight: _Flight, renderer: Renderer, indices: tuple[int, ...]) -> None:
+    site, true_poses = flight.scene()
+    logged_as = logged_poses(true_poses, CONSUMER_DRONE, flight.seed)
+    rotations, camera = true_poses.rotation_enu_from_cam, renderer.camera
+    for index in indices:
+        picture, depth = renderer.render(rotations[index], true_poses.centre_in_enu_m[index])
+        image = exposed(picture, np.random.default_rng([flight.seed, 6, index]))
+        name = frame_id(index)
+        save_photo(flight.folder / "photos" / f"{name}.JPG", image, camera, logged(site, logged_as, index))
+        if not flight.lawn and index != missing_frame(flight.frames):
+            shown = true_poses.exposure(index) + camera_time_error()
+            save_bare(flight.folder / "bare" / f"{name}.JPG", image, camera, shown)
+        save_depth(flight.folder / "truth" / "depth" / f"{name}.npz", depth)
+
+
+def _write(flight: _Flight, camera: Camera) -> tuple[int, int]:
+    """Writes what goes with the photos; returns the numbers of control point observations and LiDAR returns."""
+    site, true_poses = flight.scene()
     returns = survey(site)
-    write_tiles(site, returns, folder / "lidar")
+    write_tiles(site, returns, flight.folder / "lidar")
     observations = observe(site, camera, true_poses)
     texts = {
         "gcp_list.txt": gcp_list(site, observations),
         "truth/poses.csv": poses_csv(site, true_poses),
         "truth/site.json": site_json(site, camera, CONSUMER_DRONE, true_poses, observations),
-        "workflow.toml": _WORKFLOW + _STAGES,
+        "workflow.toml": _WORKFLOW + _STAGES.format(lidar="lidar/*.laz"),
         CAMERA_FILE: camera_yaml(camera),
-        **workflows(_STAGES),
+        **workflows(_STAGES.format(lidar="lidar/*.laz")),
     }
-    write_logs(folder / "logs", site, camera, logged_poses(true_poses, CONSUMER_DRONE, shares[0].seed))
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
+    write_logs(flight.folder / "logs", site, camera, logged_poses(true_poses, CONSUMER_DRONE, flight.seed))
+    _write_texts(flight.folder, texts)
     return len(observations), len(returns.line)
 
 
-def _scene(seed: int, frames: int) -> tuple[Site, Trajectory]:
-    site = Site.seeded(seed)
-    return site, fly(site.terrain, frames, seed)
+def _write_lawn(flight: _Flight, camera: Camera) -> int:
+    """Writes what goes with the second flight's photos, and its workflow beside the first's; returns the returns."""
+    site, true_poses = flight.scene()
+    returns = survey(site)
+    write_tiles(site, returns, flight.folder / "lidar")
+    texts = {
+        "truth/poses.csv": poses_csv(site, true_poses),
+        "truth/site.json": site_json(site, camera, CONSUMER_DRONE, true_poses, []),
+        f"../{_LAWN_FILE}": _LAWN_WORKFLOW + _STAGES.format(lidar=f"{_LAWN_FOLDER}/lidar/*.laz"),
+    }
+    _write_texts(flight.folder, texts)
+    return len(returns.line)
 
 
-def _render(share: _Share) -> None:
-    site, true_poses = _scene(share.seed, share.frames)
-    logged_as = logged_poses(true_poses, CONSUMER_DRONE, share.seed)
-    renderer = Renderer(share.camera, camera_rays(share.camera), Shader.of(site))
-    rotations = true_poses.rotation_enu_from_cam
-    for index in share.indices:
-        picture, depth = renderer.render(rotations[index], true_poses.centre_in_enu_m[index])
-        image = exposed(picture, np.random.default_rng([share.seed, 6, index]))
-        name = frame_id(index)
-        save_photo(share.folder / "photos" / f"{name}.JPG", image, share.camera, logged(site, logged_as, index))
-        if index != missing_frame(share.frames):
-            shown = true_poses.exposure(index) + camera_time_error()
-            save_bare(share.folder / "bare" / f"{name}.JPG", image, share.camera, shown)
-        save_depth(share.folder / "truth" / "depth" / f"{name}.npz", depth)
+def _write_texts(folder: Path, texts: dict[str, str]) -> None:
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ from pipeline.geometry.arrays import Bytes, Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.simulation.shading import Shader
 from pipeline.simulation.site import Hits, Site
-from pipeline.simulation.solids import Building, Pole
+from pipeline.simulation.solids import Solid
 from pipeline.simulation.texture import Singles
 
 # A small drone's camera at reduced size; its principal point is off centre and its lens bends a little.
@@ -103,7 +103,7 @@ class Renderer:
                 hits.update(at, number, *self.shader.site.solids[number].cast(centre, directions[at]))
         return hits
 
-    def _window(self, solid: Building | Pole, rotation: Floats, centre: Floats) -> tuple[slice, slice]:
+    def _window(self, solid: Solid, rotation: Floats, centre: Floats) -> tuple[slice, slice]:
         """Rows and columns of the image outside of which the solid cannot be."""
         corners = (solid.corners() - centre) @ rotation
         nothing = slice(0, 0), slice(0, 0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.simulation.site import GROUND, SKY, Hits, Site, place
-from pipeline.simulation.solids import BACK, FRONT, LEFT, RIGHT, TOP, Building, Pole
+from pipeline.simulation.solids import BACK, FRONT, LEFT, RIGHT, TOP, Building, Crown, Pole
 from pipeline.simulation.texture import Noise, Singles, inside, look_up
 from pipeline.simulation.vectors import dot, length, squared_distance_to_line
 
@@ -17,10 +17,12 @@ _HAZE_M = 2500.0
 _FINE_M = tuple(0.05 * 2.0**k for k in range(10))
 _COARSE_M = (6.0, 13.0, 28.0)
 _WALL_M = tuple(0.025 * 2.0**k for k in range(9))
+_LEAVES_M = (0.1, 0.2, 0.4, 0.8)
 _GRASS, _SOIL, _ROAD = (92.0, 112.0, 62.0), (156.0, 130.0, 98.0), (112.0, 111.0, 114.0)
 _HORIZON, _ZENITH, _TREES = (214.0, 220.0, 226.0), (126.0, 164.0, 214.0), (112.0, 126.0, 112.0)
 _WALLS = ((186, 160, 130), (158, 96, 78), (198, 190, 176), (140, 142, 146), (176, 142, 96), (120, 128, 112))
 _ROOFS = ((120, 112, 106), (150, 88, 70), (96, 100, 108), (168, 162, 150))
+_LEAVES = (78.0, 98.0, 56.0)
 _GLASS, _FRAME = (52.0, 62.0, 78.0), (222.0, 220.0, 214.0)
 # Roads run along the flight at 7 m to its right and across it at 83 m.
 _ROADS_M = ((1, 7.0), (0, 83.0))
@@ -86,7 +88,7 @@ class Shader:
             else:
                 colour = self._solid(thing, hits.face[at], p, unit, footprint)
             haze = (1.0 - np.exp(distance_m / -_HAZE_M)).astype(np.float32)
-            out[at] = _mix(colour, _HORIZON, haze)
+            out[at] = mix(colour, _HORIZON, haze)
         return out
 
     def _sky(self, unit: Floats, pixel_rad: float) -> Singles:
@@ -95,32 +97,39 @@ class Shader:
         clouds = self.noise.bands(
             unit[:, 0] / (rise + 0.12), unit[:, 1] / (rise + 0.12), np.full(len(rise), 0.02, np.float32), (1.0, 0.5), 50
         )
-        colour = _mix(_solid_colour(_HORIZON, len(rise)), _ZENITH, np.clip(rise * 2.6, 0.0, 1.0))
+        colour = mix(plain(_HORIZON, len(rise)), _ZENITH, np.clip(rise * 2.6, 0.0, 1.0))
         colour += (clouds * np.clip(rise * 40.0, 0.0, 5.0))[:, None]
         angle = np.full(len(rise), pixel_rad, np.float32)
         crowns = self.noise.bands(bearing, np.zeros_like(bearing), angle, (0.005, 0.01, 0.04, 0.2), 53)
         leaves = self.noise.bands(bearing, unit[:, 2], angle, (0.003, 0.006, 0.012), 57)
-        trees = _solid_colour(_TREES, len(rise)) * (1.0 + 0.06 * leaves[:, None])
-        return _mix(colour, trees, inside(0.009 + 0.0022 * crowns - rise, angle))
+        trees = plain(_TREES, len(rise)) * (1.0 + 0.06 * leaves[:, None])
+        return mix(colour, trees, inside(0.009 + 0.0022 * crowns - rise, angle))
 
     def _ground(self, p: Floats, unit: Floats, footprint: Singles) -> Singles:
         x, y = p[:, 0], p[:, 1]
+        normal, stretched = self._lie(x, y, unit, footprint)
+        fine = self.noise.bands(x, y, stretched, _FINE_M, 0)
+        coarse = self.noise.bands(x, y, stretched, _COARSE_M, 20)
+        grass = _step(0.7 * coarse + 0.25 * fine)
+        colour = mix(plain(_SOIL, len(p)), _GRASS, grass) * (1.0 + 0.05 * coarse[:, None])
+        road, paint = self._roads(x, y, stretched)
+        colour = mix(colour, _ROAD, road) * np.maximum(1.0 + (0.10 - 0.04 * road) * fine, 0.15)[:, None]
+        colour = self._targets(mix(colour, _FRAME, paint), x, y, stretched)
+        return colour * self._light(normal, self._sunlit(x, y))[:, None]
+
+    def _lie(self, x: Floats, y: Floats, unit: Floats, footprint: Singles) -> tuple[Floats, Singles]:
+        """How the ground lies to the rays: its normals, and the size of a pixel on it."""
         _, slope_x, slope_y = self.site.terrain.surface(x, y)
         steep = 1.0 / np.sqrt(1.0 + slope_x**2 + slope_y**2)
         normal = np.stack([-slope_x * steep, -slope_y * steep, steep], axis=1)
         facing = np.maximum(-dot(normal, unit), 0.02).astype(np.float32)
-        stretched: Singles = (footprint / np.sqrt(facing)).astype(np.float32)
-        fine = self.noise.bands(x, y, stretched, _FINE_M, 0)
-        coarse = self.noise.bands(x, y, stretched, _COARSE_M, 20)
-        grass = _step(0.7 * coarse + 0.25 * fine)
-        colour = _mix(_solid_colour(_SOIL, len(p)), _GRASS, grass) * (1.0 + 0.05 * coarse[:, None])
-        road, paint = self._roads(x, y, stretched)
-        colour = _mix(colour, _ROAD, road) * np.maximum(1.0 + (0.10 - 0.04 * road) * fine, 0.15)[:, None]
-        colour = self._targets(_mix(colour, _FRAME, paint), x, y, stretched)
+        return normal, (footprint / np.sqrt(facing)).astype(np.float32)
+
+    def _sunlit(self, x: Floats, y: Floats) -> Singles:
+        """Share of the sun that reaches the ground."""
         column = (x - self.shadow_corner_m[0]) / _SHADOW_STEP_M
         row = (y - self.shadow_corner_m[1]) / _SHADOW_STEP_M
-        sunlit = look_up(self.shadow, column.astype(np.float32), row.astype(np.float32))
-        return colour * self._light(normal, sunlit)[:, None]
+        return look_up(self.shadow, column.astype(np.float32), row.astype(np.float32))
 
     def _roads(self, x: Floats, y: Floats, footprint: Singles) -> tuple[Singles, Singles]:
         """Shares of a pixel that are road and white paint."""
@@ -146,13 +155,15 @@ class Shader:
             radius = np.hypot(dx, dy)
             quarters = (2.0 * inside(dx, fp) - 1.0) * (2.0 * inside(dy, fp) - 1.0)
             grey = np.where(radius < 0.8 * _TARGET_M, 130.0 + 105.0 * quarters, 235.0).astype(np.float32)
-            colour[near] = _mix(colour[near], np.repeat(grey[:, None], 3, axis=1), inside(_TARGET_M - radius, fp))
+            colour[near] = mix(colour[near], np.repeat(grey[:, None], 3, axis=1), inside(_TARGET_M - radius, fp))
         return colour
 
     def _solid(self, number: int, face: Ints, p: Floats, unit: Floats, footprint: Singles) -> Singles:
         solid = self.site.solids[number]
         if isinstance(solid, Pole):
             return self._pole(solid, number, face, p, footprint)
+        if isinstance(solid, Crown):
+            return self._crown(solid, number, p, footprint)
         out = np.empty((len(p), 3), np.float32)
         for side in (FRONT, BACK, RIGHT, LEFT, TOP):
             at = np.flatnonzero(face == side)
@@ -172,14 +183,14 @@ class Shader:
         half = solid.half_length_m if along_x else solid.half_width_m
         below = solid.half_m[2] - local[:, 2]
         fine = self.noise.bands(s + 41.0 * salt, below, footprint, _WALL_M, 30)
-        colour = _solid_colour(_WALLS[(salt // 8) % len(_WALLS)], len(s)) * (1.0 + 0.075 * fine[:, None])
+        colour = plain(_WALLS[(salt // 8) % len(_WALLS)], len(s)) * (1.0 + 0.075 * fine[:, None])
         ledge = inside(0.12 - np.abs(np.mod(below - 0.5, _STOREY_M) - 0.12), footprint)
-        colour = _mix(colour, colour * np.float32(1.25), ledge)
+        colour = mix(colour, colour * np.float32(1.25), ledge)
         count = max(int(2.0 * half / _WINDOW_PITCH_M), 1)
         column = s / _WINDOW_PITCH_M + 0.5 * count
         row = (below - 0.9) / _STOREY_M
         number = np.floor(column), np.floor(row)
-        chance = _chance(self.site.seed + salt, number[0], number[1])
+        chance = chances(self.site.seed + salt, number[0], number[1])
         real = (number[0] >= 0) & (number[0] < count) & (number[1] >= 0) & (chance[0] > 0.12)
         u = (column - number[0] - 0.5) * _WINDOW_PITCH_M
         v = (row - number[1]) * _STOREY_M - 0.75
@@ -188,23 +199,23 @@ class Shader:
         pane = inside(wide - np.abs(u), footprint) * inside(0.7 - np.abs(v), footprint) * real
         pane *= 1.0 - inside(0.03 - np.abs(u), footprint)
         blind = inside(v + 0.7 - 1.4 * (1.0 - chance[2]), footprint)
-        glass = _mix(_solid_colour(_FRAME, len(s)) * np.float32(0.8), _GLASS, blind)
+        glass = mix(plain(_FRAME, len(s)) * np.float32(0.8), _GLASS, blind)
         glass *= (0.7 + 0.6 * chance[3]).astype(np.float32)[:, None] * (1.0 + 0.05 * fine[:, None])
-        return _mix(_mix(colour, _FRAME, frame), glass, pane)
+        return mix(mix(colour, _FRAME, frame), glass, pane)
 
     def _roof(self, solid: Building, salt: int, local: Floats, footprint: Singles, side: int) -> Singles:
         del side
         x, y = local[:, 0], local[:, 1]
         fine = self.noise.bands(x + 41.0 * salt, y, footprint, _WALL_M, 40)
-        colour = _solid_colour(_ROOFS[(salt // 8) % len(_ROOFS)], len(x)) * (1.0 + 0.08 * fine[:, None])
+        colour = plain(_ROOFS[(salt // 8) % len(_ROOFS)], len(x)) * (1.0 + 0.08 * fine[:, None])
         cell = np.floor(x / 2.2), np.floor(y / 2.2)
-        chance = _chance(self.site.seed + salt, *cell)
+        chance = chances(self.site.seed + salt, *cell)
         u, v = x - (cell[0] + 0.5) * 2.2, y - (cell[1] + 0.5) * 2.2
         hatch = inside(0.35 + 0.4 * chance[1] - np.abs(u), footprint)
         hatch *= inside(0.35 + 0.4 * chance[2] - np.abs(v), footprint) * (chance[0] > 0.72)
-        colour = _mix(colour, colour * (0.45 + 1.2 * chance[3]).astype(np.float32)[:, None], hatch)
+        colour = mix(colour, colour * (0.45 + 1.2 * chance[3]).astype(np.float32)[:, None], hatch)
         rim = np.minimum(solid.half_length_m - np.abs(x), solid.half_width_m - np.abs(y))
-        return _mix(colour, colour * np.float32(1.3), inside(0.3 - rim, footprint))
+        return mix(colour, colour * np.float32(1.3), inside(0.3 - rim, footprint))
 
     def _pole(self, pole: Pole, number: int, face: Ints, p: Floats, footprint: Singles) -> Singles:
         dx, dy = p[:, 0] - pole.east_m, p[:, 1] - pole.north_m
@@ -212,10 +223,19 @@ class Shader:
         below = pole.top_m - p[:, 2]
         fine = self.noise.bands(round_m + 13.0 * number, below, footprint, _WALL_M[:7], 44)
         band = inside(0.5 - np.abs(np.mod(below, 2.0) - 1.0), footprint) * np.float32(number % 2)
-        colour = _mix(_solid_colour((150, 140, 126), len(p)), (196.0, 70.0, 58.0), band) * (1.0 + 0.12 * fine[:, None])
+        colour = mix(plain((150, 140, 126), len(p)), (196.0, 70.0, 58.0), band) * (1.0 + 0.12 * fine[:, None])
         mantle = np.stack([dx, dy, np.zeros_like(dx)], axis=1) / pole.radius_m
         normal = np.where((face == TOP)[:, None], [[0.0, 0.0, 1.0]], mantle)
         return colour * self._light(normal, np.ones(1, np.float32))[:, None]
+
+    def _crown(self, crown: Crown, number: int, p: Floats, footprint: Singles) -> Singles:
+        normal = (p - crown.centre_in_enu_m) / crown.radius_m
+        # Two projections, so that neither the top nor the sides are smeared.
+        fine = self.noise.bands(p[:, 0] + 17.0 * number, p[:, 1], footprint, _LEAVES_M, 34)
+        fine = 0.7 * fine + 0.7 * self.noise.bands(p[:, 2] + 17.0 * number, p[:, 0] - p[:, 1], footprint, _LEAVES_M, 39)
+        light = self._light(normal, np.ones(1, np.float32)) * np.maximum(1.0 + 0.06 * fine, 0.2)
+        out: Singles = plain(_LEAVES, len(p)) * light[:, None]
+        return out
 
     def _light(self, normal: Floats, sunlit: Singles) -> Singles:
         """Lambert's law under one sun and an even sky."""
@@ -247,11 +267,12 @@ def _shadow(site: Site, corner_m: tuple[float, float]) -> Singles:
 _BINOMIAL = tuple((i, j, (1, 2, 1)[i] * (1, 2, 1)[j] / 16.0) for i in range(3) for j in range(3))
 
 
-def _solid_colour(colour: tuple[float, ...], n: int) -> Singles:
+def plain(colour: tuple[float, ...], n: int) -> Singles:
+    """(n, 3) of one colour."""
     return np.repeat(np.asarray(colour, np.float32)[None, :], n, axis=0)
 
 
-def _mix(colour: Singles, other: Singles | tuple[float, ...], share: Singles) -> Singles:
+def mix(colour: Singles, other: Singles | tuple[float, ...], share: Singles) -> Singles:
     """(n, 3) colours blended by (n,) shares of the other."""
     out: Singles = colour + (np.asarray(other, np.float32) - colour) * np.asarray(share, np.float32)[:, None]
     return out
@@ -264,7 +285,7 @@ def _step(value: Singles) -> Singles:
     return out
 
 
-def _chance(seed: int, column: Floats, row: Floats) -> Floats:
+def chances(seed: int, column: Floats, row: Floats) -> Floats:
     """(4, n) numbers in 0..1 that depend on the cell alone."""
     table = np.random.default_rng([seed, 4]).random((4, 16, 64))
     found: Floats = table[:, row.astype(np.int64) % 16, column.astype(np.int64) % 64]

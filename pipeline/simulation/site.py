@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.simulation.solids import Building, Pole
+from pipeline.simulation.solids import Building, Pole, Solid
 from pipeline.simulation.terrain import Hill, Terrain
 from pipeline.simulation.vectors import dot, length, squared_distance_to_line
 
@@ -65,7 +65,7 @@ class Site:
     Args:
         frame: Its ENU frame; heights are ellipsoidal.
         terrain: The ground.
-        solids: Buildings, then poles.
+        solids: Buildings first.
         control_in_enu_m: (k, 3) centres of the painted control points, on the ground.
         to_sun: (3,) unit vector, ENU.
         seed: Of its shapes and textures.
@@ -73,7 +73,7 @@ class Site:
 
     frame: LocalFrame
     terrain: Terrain
-    solids: tuple[Building | Pole, ...]
+    solids: tuple[Solid, ...]
     control_in_enu_m: Floats
     to_sun: Floats
     seed: int
@@ -83,12 +83,11 @@ class Site:
         """The example's site: 16 buildings in a loose grid about two roads, and 10 poles."""
         rng = np.random.default_rng([seed, 0])
         terrain = _terrain(rng)
-        solids: list[Building | Pole] = [_building(rng, terrain, f, r) for f in _ROWS_M for r in _COLUMNS_M]
+        solids: list[Solid] = [_building(rng, terrain, f, r) for f in _ROWS_M for r in _COLUMNS_M]
         solids += [_pole(rng, terrain, float(f), float(r)) for f, r in _POLES]
         control = place(np.array(_CONTROL))
         control = np.column_stack([control, terrain.height(control[:, 0], control[:, 1])])
-        to_sun = np.array([0.45, -0.55, 0.78])
-        return cls(ORIGIN, terrain, tuple(solids), control, to_sun / np.linalg.norm(to_sun), seed)
+        return cls(ORIGIN, terrain, tuple(solids), control, sun(), seed)
 
     def cast(self, origins: Floats, directions: Floats) -> Hits:
         """What rays meet first.
@@ -130,6 +129,13 @@ class Site:
         rays = p_in_enu_m - origins
         out: Bools = (1.0 - self.cast(origins, rays).distance) * length(rays) < slack_m
         return out
+
+
+def sun() -> Floats:
+    """(3,) unit vector to the sun of the flight's hour, ENU."""
+    to_sun = np.array([0.45, -0.55, 0.78])
+    out: Floats = to_sun / np.linalg.norm(to_sun)
+    return out
 
 
 def place(forward_right_m: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What stands on the ground: buildings as upright boxes, poles as upright cylinders, and where rays meet them."""
+"""What stands on the ground: buildings as boxes, poles as cylinders, crowns as balls, and where rays meet them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.arrays import Floats, Ints
+from pipeline.simulation.vectors import dot, squared_distance_to_line
 
-# Faces of a building: the two across its length, the two along it, and the roof. A pole's are its mantle and its top.
+# Faces of a building: the two across its length, the two along it, and the roof. A pole's are its mantle and its top;
+# a crown has its mantle alone.
 FRONT, BACK, RIGHT, LEFT, TOP = range(5)
 MANTLE = FRONT
 _TINY = 1e-300
@@ -153,3 +155,57 @@ class Pole:
         side, cap = np.where(on_side, side, np.inf), np.where(on_cap, cap, np.inf)
         nearest: Floats = np.minimum(side, cap)
         return nearest, np.where(cap < side, TOP, MANTLE).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Crown:
+    """A ball: the crown of a tree, or a bush.
+
+    Args:
+        east_m: Centre, ENU.
+        north_m: Centre, ENU.
+        up_m: Centre, ENU.
+        radius_m: Of the ball.
+    """
+
+    east_m: float
+    north_m: float
+    up_m: float
+    radius_m: float
+
+    @property
+    def centre_in_enu_m(self) -> Floats:
+        """(3,) centre of the ball."""
+        return np.array([self.east_m, self.north_m, self.up_m])
+
+    @property
+    def reach_m(self) -> float:
+        """Radius of the ball about the centre that holds it: its own."""
+        return self.radius_m
+
+    def corners(self) -> Floats:
+        """(8, 3) ENU, m: of the upright box that holds it."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+        return self.centre_in_enu_m + signs * self.radius_m
+
+    def cast(self, origins: Floats, directions: Floats) -> tuple[Floats, Ints]:
+        """Where rays meet the ball; from inside, where they leave it.
+
+        Args:
+            origins: (3,) or (n, 3) ENU, m.
+            directions: (n, 3) ENU, any length.
+
+        Returns:
+            (n,) multiples of the direction, inf for a miss; (n,) the face met, MANTLE.
+        """
+        o = np.atleast_2d(origins) - self.centre_in_enu_m
+        size = dot(directions, directions)
+        # The square of the ray's distance to the centre, free of the cancellation in b^2 - a c.
+        room = self.radius_m**2 * size - squared_distance_to_line(np.zeros(3), o, directions)
+        middle, half = -dot(o, directions) / size, np.sqrt(np.maximum(room, 0.0)) / size
+        first = np.where(middle > half, middle - half, middle + half)
+        hit = (room >= 0.0) & (first > 0.0)
+        return np.where(hit, first, np.inf), np.full(len(first), MANTLE, np.int64)
+
+
+Solid = Building | Pole | Crown

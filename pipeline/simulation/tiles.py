@@ -14,9 +14,9 @@ from pyproj import CRS
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.simulation.grid import COMPOUND_CRS, grid_from_enu
 from pipeline.simulation.site import GROUND, Site, place
-from pipeline.simulation.solids import Building
+from pipeline.simulation.solids import Building, Crown, Solid
 
-CLASS_GROUND, CLASS_BUILDING, CLASS_NOISE, CLASS_POLE = 2, 6, 7, 64
+CLASS_GROUND, CLASS_VEGETATION, CLASS_BUILDING, CLASS_NOISE, CLASS_POLE = 2, 5, 6, 7, 64
 NOISE_M = 0.02
 ABOVE_ORIGIN_M = 380.0
 WIDEST_DEG = 20.0
@@ -109,7 +109,7 @@ def _scan(site: Site, rng: np.random.Generator, number: int, axis: int, offset_m
     hits = site.cast(origins, directions)
     met = np.flatnonzero(np.isfinite(hits.distance))
     p = origins[met] + hits.distance[met, None] * directions[met]
-    classes = np.array([CLASS_BUILDING if isinstance(s, Building) else CLASS_POLE for s in site.solids])
+    classes = np.array([_class_of(solid) for solid in site.solids])
     thing = hits.thing[met]
     # Right of a line along `forward` is `right`; right of one along `right` is backward.
     to_right = across if axis == 0 else -across
@@ -120,6 +120,13 @@ def _scan(site: Site, rng: np.random.Generator, number: int, axis: int, offset_m
         np.full(len(met), number + 1),
         300.0 * number + (aim[met, axis] - (_FORWARD_M, _RIGHT_M)[axis][0]) / _LINE_SPEED_M_S,
     )
+
+
+def _class_of(solid: Solid) -> int:
+    """The LAS class of a solid's returns."""
+    if isinstance(solid, Building):
+        return CLASS_BUILDING
+    return CLASS_VEGETATION if isinstance(solid, Crown) else CLASS_POLE
 
 
 def _stray(rng: np.random.Generator) -> Returns:

@@ -16,7 +16,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import quaternion_from_rotation
 from pipeline.simulation.control import Observation
-from pipeline.simulation.flight import FIRST_EXPOSURE, PoseNoise, Trajectory, frame_id
+from pipeline.simulation.flight import PoseNoise, Trajectory, frame_id
 from pipeline.simulation.grid import COMPOUND_CRS
 from pipeline.simulation.site import UNDULATION_M, Site
 
@@ -78,7 +78,7 @@ def site_json(
     facts: dict[str, Any] = {
         "seed": site.seed,
         "frames": len(true_poses),
-        "first_exposure": FIRST_EXPOSURE.isoformat(),
+        "first_exposure": true_poses.exposure(0).isoformat(),
         "frame_enu": asdict(site.frame) | {"height_datum": "ellipsoid"},
         "crs": COMPOUND_CRS,
         "undulation_m": UNDULATION_M,

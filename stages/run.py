@@ -13,7 +13,7 @@ from pipeline.engine.config import Sections, absolute_paths, load_workflow, pars
 from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
-from stages.options import Jobs, Scheduler, Set
+from stages.options import Device, Jobs, Scheduler, Set, on_device
 from stages.registry import MODELS, STAGES
 from stages.workflow import chosen_stages, execute
 
@@ -25,6 +25,7 @@ def command(
     first: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="Run again from this stage.")] = None,
     last: Annotated[str | None, typer.Option("--to", metavar="STAGE", help="Stop after this stage.")] = None,
     jobs: Jobs = None,
+    device: Device = None,
     scheduler: Scheduler = None,
     photos: Annotated[str | None, typer.Option(help="Photo folder, instead of a workflow.")] = None,
     logs: Annotated[list[str] | None, typer.Option(help="Log or bag with the poses; repeatable.")] = None,
@@ -36,7 +37,11 @@ def command(
 ) -> None:
     """Runs every stage the workflow has a section for; what is up to date is skipped."""
     given = {"photos": photos, "logs": logs, "bags": bags, "videos": videos, "camera": camera}
-    layers = [_sources(workflow, given, lidar), ("command line", parse_overrides(set_ or [], MODELS))]
+    layers = [
+        _sources(workflow, given, lidar),
+        ("command line", parse_overrides(set_ or [], MODELS)),
+        ("command line", on_device(device)),
+    ]
     configuration = resolve(layers, MODELS)
     if "ingest" not in configuration.sections:
         raise UsageError(

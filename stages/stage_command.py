@@ -12,7 +12,7 @@ from pipeline.engine.config import Sections, absolute_paths, load_workflow, pars
 from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
-from stages.options import Jobs, Scheduler, Set
+from stages.options import Device, Jobs, Scheduler, Set, on_device
 from stages.registry import MODELS, STAGES
 from stages.workflow import execute, kept_sections
 
@@ -54,11 +54,20 @@ def ingest(
     _run("ingest", folder, layers, set_, jobs, scheduler)
 
 
+def match(run: Run, set_: Set = None, jobs: Jobs = None, device: Device = None, scheduler: Scheduler = None) -> None:
+    """Runs match with the configuration kept in the run folder."""
+    layers = [*_kept("match", run), ("command line", on_device(device))]
+    _run("match", RunFolder(run), layers, set_, jobs, scheduler)
+
+
+def _kept(name: str, run: Path) -> list[tuple[str, Sections]]:
+    # A stage the kept workflow has no section for runs with its defaults.
+    return [("default", {name: {}}), ("run folder", kept_sections(RunFolder(run)))]
+
+
 def _stage_command(name: str) -> Callable[..., None]:
     def command(run: Run, set_: Set = None, jobs: Jobs = None, scheduler: Scheduler = None) -> None:
-        folder = RunFolder(run)
-        # A stage the kept workflow has no section for runs with its defaults.
-        _run(name, folder, [("default", {name: {}}), ("run folder", kept_sections(folder))], set_, jobs, scheduler)
+        _run(name, RunFolder(run), _kept(name, run), set_, jobs, scheduler)
 
     command.__doc__ = f"Runs {name} with the configuration kept in the run folder."
     return command
@@ -77,6 +86,4 @@ def _run(
     typer.echo(records[name]["summary"])
 
 
-pair, match, refine, depth, fuse, score = (
-    _stage_command(name) for name in ("pair", "match", "refine", "depth", "fuse", "score")
-)
+pair, refine, depth, fuse, score = (_stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score"))

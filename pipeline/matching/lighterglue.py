@@ -54,7 +54,7 @@ class LighterGlueNetwork:
         Raises:
             InputError: The weights are damaged, or of another network.
         """
-        state = {_kornia_name(name): value for name, value in load_state(self.weights).items()}
+        state = _matcher_part(load_state(self.weights))
         layers = 1 + max((int(name.split(".")[1]) for name in state if name.startswith("transformers.")), default=-1)
         if not layers:
             raise wrong_network(self.weights, "LighterGlue", list(state))
@@ -140,9 +140,13 @@ def _allowed(reach: Reach, n_ref: int, n_src: int) -> Bools:
     )
 
 
-def _kornia_name(name: str) -> str:
-    """The name that kornia's module has for a parameter of the published file."""
-    short = name.removeprefix(_PREFIX)
+def _matcher_part(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The matcher's parameters by kornia's names; the published file holds its extractor's too."""
+    own = {name: value for name, value in state.items() if name.startswith(_PREFIX)} or state
+    return {_kornia_name(name.removeprefix(_PREFIX)): value for name, value in own.items()}
+
+
+def _kornia_name(short: str) -> str:
     kind, _, rest = short.partition(".")
     if kind not in {"self_attn", "cross_attn"}:
         return short

@@ -24,6 +24,9 @@ from pipeline.matching.xfeat import XFeatNetwork, padded, unit
 # The scales the image is looked at, and each one's share of the features (the paper's).
 _SCALES = ((0.6, 0.2), (1.3, 0.8))
 _CELL_PX = 8
+# Where the cell's first pixel lies from the point that the offset is told from. Measured on matches of known depth, at
+# both scales and along both axes alike: counted from the fourth pixel, as published, all offsets are one pixel short.
+_FIRST_PX = 3
 # The network tells an offset by its probabilities over the cell, sharpened, and is sure enough of it from here on.
 _SHARPNESS, _LEAST_CONFIDENCE = 3.0, 0.25
 
@@ -137,6 +140,6 @@ class StarMatcher:
             both = torch.from_numpy(np.concatenate([ref, src], axis=1)).to(device)
             logits = _SHARPNESS * model.net.fine_matcher(both)
             chance = logits.softmax(dim=1).cpu().numpy().astype(np.float64)
-        index = np.arange(_CELL_PX) - _CELL_PX // 2
+        index = np.arange(_CELL_PX) - _FIRST_PX
         across, down = np.tile(index, _CELL_PX), np.repeat(index, _CELL_PX)
         return np.stack([chance @ across, chance @ down], axis=1), chance.max(axis=1)

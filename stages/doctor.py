@@ -18,7 +18,7 @@ from pipeline.engine.errors import MissingPartError, UndeterminedError
 from pipeline.engine.executors import usable_cores
 from pipeline.geodesy.heights import Geoid
 from pipeline.matching.known_weights import NETWORKS_OF
-from pipeline.matching.weights import compute_device, find_weights
+from pipeline.matching.weights import find_weights
 
 REQUIRED = (
     "numpy",
@@ -45,12 +45,15 @@ DATUMS = ("egm96", "egm2008")
 
 def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False) -> None:
     """Checks versions, optional parts, weights, PROJ grids, GPU, disk and memory."""
+    # torch takes seconds to import.
+    from pipeline.matching.devices import device_in_words  # noqa: PLC0415
+
     found = {
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in REQUIRED},
         "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
         "weights": {"/".join(group): _weights(group) for needs in NETWORKS_OF.values() for group in needs},
-        "torch_device": compute_device(),
+        "torch_device": device_in_words(),
         "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(name) for name in DATUMS}},
         "leap_seconds_known_until": f"{TABLE_HOLDS_UNTIL:%Y-%m-%d}",
         "cores": usable_cores(),

@@ -117,3 +117,9 @@ def _empty_cache(device: torch.device) -> None:
         torch.cuda.empty_cache()
     elif device.type == "mps" and torch.backends.mps.is_available():
         torch.mps.empty_cache()
+
+
+def device_in_words() -> str:
+    """What networks run on by themselves: the GPU's name, "mps", or "cpu only"."""
+    kind = _there()[0]
+    return torch.cuda.get_device_name() if kind == "cuda" else {"cpu": "cpu only"}.get(kind, kind)

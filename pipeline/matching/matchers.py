@@ -5,19 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pipeline.matching.known_weights import NETWORKS_OF
 from pipeline.matching.matcher import Matcher
 from pipeline.matching.sift import SiftExtractor, SiftMatcher
 from pipeline.matching.weights import FoundWeights, find_weights
 
-# Of each network a matcher needs, the names it may go by; the first that is found serves.
-NETWORKS: Mapping[str, tuple[tuple[str, ...], ...]] = {
-    "sift": (),
-    "xfeat": (("xfeat",),),
-    "xfeat-star": (("xfeat",),),
-    "xfeat-lighterglue": (("xfeat",), ("lighterglue",)),
-    "raft": (("raft-small", "raft-large"),),
-    "dis": (),
-}
 DENSE = ("raft", "dis")
 # Most features of an image: what a matcher takes in its stride.
 _MAX_FEATURES: Mapping[str, int] = {
@@ -37,11 +29,11 @@ class MatcherSetting:
     """What a matcher is built from; small and picklable, for it goes to every worker.
 
     Args:
-        name: One of NETWORKS.
+        name: Its name in the configuration.
         max_image_px: Longest side an image is matched at.
         max_features: Most features of an image, or points of a dense matcher; None for the matcher's own number.
         ratio: Largest ratio of best to second-best distance; None for the matcher's own.
-        weights: Files of its networks, in the order of NETWORKS.
+        weights: Files of its networks, in the order of NETWORKS_OF.
         device: "cpu", "cuda" or "mps".
     """
 
@@ -78,7 +70,7 @@ def device_of(name: str, wanted: str) -> str:
     Raises:
         ResourceError: The device that is wanted is not there.
     """
-    if not NETWORKS[name]:
+    if not NETWORKS_OF.get(name, ()):
         return "cpu"
     from pipeline.matching.devices import choose_device  # noqa: PLC0415
 
@@ -96,4 +88,4 @@ def weights_of(name: str, configured: str | tuple[str, ...] | None) -> tuple[Fou
         MissingPartError: A network has no weights here.
         InputError: A file that is named is not there, or nobody knows its digest.
     """
-    return tuple(find_weights(networks, configured or ()) for networks in NETWORKS[name])
+    return tuple(find_weights(networks, configured or ()) for networks in NETWORKS_OF.get(name, ()))

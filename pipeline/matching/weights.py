@@ -384,12 +384,3 @@ def _keys(what: str, names: list[str]) -> str:
         return ""
     more = f" and {len(names) - _SHOWN_KEYS} more" if len(names) > _SHOWN_KEYS else ""
     return f"{what}: {', '.join(names[:_SHOWN_KEYS])}{more}"
-
-
-def compute_device() -> str:
-    """What networks run on by themselves: the GPU's name, "mps", or "cpu only"."""
-    import torch  # noqa: PLC0415 - as above
-
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
-    return "mps" if torch.backends.mps.is_available() else "cpu only"

@@ -29,7 +29,6 @@ from pipeline.flight import (
     selected_pairs,
 )
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.geometry.cameras import PixelSigma
 from pipeline.geometry.poses import Pose, relative_pose
 from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.geometry.transfer import VirtualView
@@ -38,28 +37,14 @@ METHODS = {"adaptive": "epitransfer", "DLT": "dlt"}
 REDRAWS, MATCHES_PER_PAIR, SEED = 200, 100, 11
 # A match farther from the truth is wrong, not noisy.
 WRONG_PX = 3.0
+# Of a chi-square distribution with two degrees of freedom.
+MEDIAN_SQUARE = 1.386
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the run was made with, from its manifest.
-
-    Args:
-        sigma: Of matched positions.
-        limits: What a published depth has to keep.
-    """
-
-    sigma: PixelSigma
-    limits: Limits
-
-    @classmethod
-    def of(cls, run: Path) -> Settings:
-        """The settings of a run."""
-        match, depth = configured(run, "match"), configured(run, "depth")
-        return cls(
-            PixelSigma(match["sigma_px"], match["max_image_px"]),
-            Limits(depth["max_relative_sigma"], depth["max_range_m"]),
-        )
+def limits_of(run: Path) -> Limits:
+    """What a published depth of a run has to keep, from its manifest."""
+    depth = configured(run, "depth")
+    return Limits(depth["max_relative_sigma"], depth["max_range_m"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +55,10 @@ class PairTruth:
         pair: The pair.
         leg: Where it was flown.
         neighbours: Whether its photos follow one another.
-        rays: The matches.
+        rays: The matches, each with its own covariance.
         depth_m: (n,) true depths in ref, m.
-        error_px: (n,) distance of the src pixel from the truth.
+        error_px: (n, 2) src pixel less the true one.
+        covariance: (n, 3) px^2, stated for it: uu, uv, vv.
     """
 
     pair: PairRow
@@ -81,11 +67,18 @@ class PairTruth:
     rays: MatchedRays
     depth_m: Floats
     error_px: Floats
+    covariance: Floats
+
+    @property
+    def squares(self) -> Floats:
+        """(n,) the error's square in units of the covariance; of Gaussian errors half are below MEDIAN_SQUARE."""
+        uu, uv, vv = self.covariance.T
+        u, v = self.error_px.T
+        out: Floats = (vv * u * u - 2.0 * uv * u * v + uu * v * v) / (uu * vv - uv * uv)
+        return out
 
 
-def pairs_with_truth(
-    run: Path, truth: FlightTruth, sigma: PixelSigma, per_pair: int = MATCHES_PER_PAIR
-) -> list[PairTruth]:
+def pairs_with_truth(run: Path, truth: FlightTruth, per_pair: int = MATCHES_PER_PAIR) -> list[PairTruth]:
     """A random choice of every selected pair's inliers that have a truth."""
     frames = read_table(run / "frames.parquet", "frames")
     cameras = camera_by_frame(frames, cameras_of(read_table(run / "cameras.parquet", "cameras")))
@@ -101,6 +94,7 @@ def pairs_with_truth(
         has = np.flatnonzero(np.isfinite(depth))
         rows = np.sort(rng.permutation(has)[:per_pair])
         ref_px, src_px, depth = ref_px[rows], src_px[rows], depth[rows]
+        covariance = columns(some, ("cov_uu", "cov_uv", "cov_vv"))[rows]
         camera = cameras[pair.ref]
         error = reprojection_errors(ref_px, src_px, depth, camera, ref=truth.poses[pair.ref], src=truth.poses[pair.src])
         out.append(
@@ -108,9 +102,10 @@ def pairs_with_truth(
                 pair,
                 truth.leg(pair.ref, pair.src),
                 truth.neighbours(pair.ref, pair.src),
-                MatchedRays.of(ref_px, src_px, camera, cameras[pair.src], sigma),
+                MatchedRays.of(ref_px, src_px, camera, cameras[pair.src], covariance),
                 depth,
-                np.linalg.norm(error, axis=1),
+                error,
+                covariance,
             )
         )
     return out
@@ -207,7 +202,7 @@ def outcomes(
                 sigma[k, part] = np.sqrt(found.depths.variance_m2)
                 kept[k, part] = found.kept
     of_pair = np.repeat(np.arange(len(pairs)), [len(pair.depth_m) for pair in pairs])
-    wrong = np.concatenate([pair.error_px for pair in pairs]) > WRONG_PX
+    wrong = np.linalg.norm(np.concatenate([pair.error_px for pair in pairs]), axis=1) > WRONG_PX
     return {
         name: Outcome(error, sigma, true_depth, kept, of_pair, wrong) for name, (error, sigma, kept) in stacks.items()
     }
@@ -238,14 +233,17 @@ def main(example: Path, run: Path, redraws: int) -> None:
     """Prints the table."""
     truth = FlightTruth.of(example)
     logged = poses_of(read_table(run / "frames.parquet", "frames"))
-    settings = Settings.of(run)
-    pairs = pairs_with_truth(run, truth, settings.sigma)
-    found = outcomes(pairs, truth, logged, settings.limits, redraws)
+    pairs = pairs_with_truth(run, truth)
+    found = outcomes(pairs, truth, logged, limits_of(run), redraws)
     print(f"Kept depths within the predicted sigma, over {redraws} redraws of the pose error that `frames` states,")
     print(f"on {len(pairs)} pairs x {MATCHES_PER_PAIR} of the run's matches; a Gaussian error has 68.3 % and 95.4 %\n")
     print(f"{'':36}{'1 sigma':>16}{'2 sigma':>16}{'kept':>9}{'AbsRel':>9}{'wrong':>8}")
     for line in lines(found, pairs):
         print(line)
+    middle = np.median(np.concatenate([pair.squares for pair in pairs]))
+    print(
+        f"Matched positions: the median square in units of their covariance is {middle:.2f}; Gaussian {MEDIAN_SQUARE}"
+    )
     print("AbsRel is over what both keep. Wrong are matches more than")
     print(f"{WRONG_PX:g} px from the truth; they are in the figures.")
 

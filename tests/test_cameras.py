@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from pixel_noise import matrices, slanted
 
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
@@ -190,6 +191,23 @@ def test_pixel_jacobian_is_the_derivative(any_camera: Camera) -> None:
 def test_pixel_jacobian_on_the_axis(any_camera: Camera) -> None:
     found = any_camera.pixel_jacobian(np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(found, np.diag([any_camera.fx, any_camera.fy]), rtol=1e-12)
+
+
+def test_plane_covariance_is_that_of_undistorted_pixels(any_camera: Camera) -> None:
+    """Finite differences of the undistortion, with a covariance of another shape and slant at every pixel."""
+    rays, h = points_in_front(60), 1e-3
+    rays = rays / rays[:, 2:]
+    pixels, covariance = any_camera.project(rays), slanted(len(rays))
+    slope = np.stack(
+        [(any_camera.rays(pixels + h * e) - any_camera.rays(pixels - h * e))[:, :2] / (2.0 * h) for e in np.eye(2)],
+        axis=2,
+    )
+    expected = slope @ matrices(covariance) @ slope.transpose(0, 2, 1)
+    found = any_camera.plane_covariance(rays, covariance)
+    assert found.shape == (3, len(rays))
+    scale = np.sqrt(expected[:, [0, 0, 1], [0, 0, 1]] * expected[:, [0, 1, 1], [0, 1, 1]])
+    np.testing.assert_allclose(found.T / scale, expected[:, [0, 0, 1], [0, 1, 1]] / scale, atol=1e-5)
+    assert any_camera.plane_covariance(rays[:0], covariance[:0]).shape == (3, 0)
 
 
 @pytest.mark.parametrize("size", [(2000, 1500), (1000, 900), (8000, 6000)])

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pixel_noise import drawn, slanted
 
-from pipeline.depthing import MatchedRays
+from pipeline.depthing import Limits, MatchedRays, depths_by
 from pipeline.geometry.arrays import Floats
-from pipeline.geometry.cameras import Camera, PixelSigma
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Pose, PoseSigmas, relative_pose
 from pipeline.geometry.rotations import enu_from_cam, gimbal_error_axes, rotation_from_vector
-from pipeline.geometry.transfer import VirtualView, transfer_with_sigma
+from pipeline.geometry.transfer import VirtualView
 from pipeline.points.merge import merge_voxels
 from pipeline.points.world import Shot, WorldPoints, world_points
 
@@ -20,7 +21,7 @@ DEG = np.pi / 180.0
 PLAIN = Camera("pinhole", 4000, 3000, 2800.0, 2810.0, 2010.0, 1490.0)
 LENS = Camera("brown", 4000, 3000, 2900.0, 2905.0, 2010.0, 1490.0, (-0.1, 0.02, 0.001, -0.0005, 0.0))
 WIDE = Camera("fisheye", 1600, 1200, 700.0, 705.0, 802.0, 597.0, (0.02, -0.003, 0.0, 0.0))
-SIGMA = PixelSigma(0.5, 2000)
+ALL = Limits(np.inf, np.inf)
 NONE = PoseSigmas(np.zeros(3), np.zeros(3))
 OWN = PoseSigmas(np.array([0.02, 0.03, 0.04]), np.array([0.05, 0.03, 0.04]) * DEG)
 COMMON = PoseSigmas(np.array([1.0, 1.5, 2.5]), np.array([0.5, 0.3, 0.2]) * DEG)
@@ -51,6 +52,8 @@ class Pair:
         camera = cameras[0]
         self.ref_px = AT * (camera.width, camera.height)
         rays = camera.rays(self.ref_px)
+        # Of the same pixels of an image that is matched at a size of its own.
+        self.covariance = slanted(len(AT), max(cameras[1].width / 2000.0, 1.0))
         self.points = (
             ref.centre + (rays / np.linalg.norm(rays, axis=1, keepdims=True) * RANGE_M[:, None]) @ ref.rotation.T
         )
@@ -73,10 +76,11 @@ class Pair:
     def placed(self, error: Floats, ref_px: Floats, src_px: Floats, *, noisy: bool = True) -> WorldPoints:
         """The points as the pipeline finds them from disturbed poses and pixels."""
         ref, src = self.poses(error)
-        rays = MatchedRays.of(ref_px, src_px, *self.cameras, SIGMA)
-        depths = transfer_with_sigma(rays.ref, rays.src, relative_pose(ref, src), VirtualView.ADAPTIVE, rays.noise)
-        shots = (Shot(c, p, SIGMA.of(c) * noisy) for c, p in zip(self.cameras, (ref, src), strict=True))
-        return world_points(ref_px, depths.depth_m, depths.normal, *shots)
+        covariance = np.tile(self.covariance, (len(ref_px) // len(AT), 1))
+        rays = MatchedRays.of(ref_px, src_px, *self.cameras, covariance)
+        found = depths_by("epitransfer", VirtualView.ADAPTIVE, 1.0, rays, relative_pose(ref, src), ALL)
+        shots = (Shot(camera, pose) for camera, pose in zip(self.cameras, (ref, src), strict=True))
+        return world_points(ref_px, found.depths.depth_m, found.depths.normal, found.pixel_sigma_m * noisy, *shots)
 
     def redrawn(self, rng: np.random.Generator, draws: int, *, own: bool, common: bool) -> Floats:
         """(draws, n, 3): where the points come to lie with disturbed poses and pixels."""
@@ -88,8 +92,8 @@ class Pair:
             ]
         )
         for _ in range(draws):
-            noise = [own * rng.normal(0.0, SIGMA.of(c), self.ref_px.shape) for c in self.cameras]
-            out.append(self.placed(rng.normal(0.0, scale), self.ref_px + noise[0], self.src_px + noise[1]).p_in_enu_m)
+            src_px = self.src_px + own * drawn(rng, self.covariance)
+            out.append(self.placed(rng.normal(0.0, scale), self.ref_px, src_px).p_in_enu_m)
         return np.array(out)
 
     def derivatives(self) -> Floats:
@@ -118,16 +122,20 @@ ENDS = {"forward": FORWARD, "sideways": SIDEWAYS}
 @pytest.mark.parametrize("cameras", CAMERAS)
 @pytest.mark.parametrize("ends", ENDS)
 def test_pixel_noise_alone(ends: str, cameras: str) -> None:
-    """Through lens distortion, off the axis, and with src of another size: what one focal length would get wrong."""
+    """Through lens distortion, off the axis, with src of another size; it moves a point along its ref ray."""
     pair = Pair(ENDS[ends], CAMERAS[cameras], {})
     rng, draws, n = np.random.default_rng(1), 4000, len(AT)
-    ref_px, src_px = (
-        np.tile(px, (draws, 1)) + rng.normal(0.0, SIGMA.of(camera), (draws * n, 2))
-        for px, camera in zip((pair.ref_px, pair.src_px), pair.cameras, strict=True)
-    )
+    ref_px, src_px = (np.tile(px, (draws, 1)) for px in (pair.ref_px, pair.src_px))
+    src_px += drawn(rng, np.tile(pair.covariance, (draws, 1)))
     points = pair.placed(np.zeros(18), ref_px, src_px).p_in_enu_m.reshape(draws, n, 3)
     predicted = pair.placed(np.zeros(18), pair.ref_px, pair.src_px)
-    assert_spread(points, predicted.own, 0.08)
+    sight = pair.points - pair.poses(np.zeros(18))[0].centre
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    length = np.sqrt(np.einsum("ni,nij,nj->n", sight, predicted.own, sight))
+    line = length[:, None] * sight
+    np.testing.assert_allclose(predicted.own, line[:, :, None] * line[:, None, :], rtol=1e-9, atol=1e-15)
+    spread = np.std(np.einsum("dni,ni->dn", points, sight), axis=0)
+    np.testing.assert_allclose(spread / length, 1.0, atol=0.06)
     assert not predicted.common.any()
 
 

@@ -126,7 +126,7 @@ def test_matches_lie_where_the_truth_puts_them_within_their_covariance(redrawn: 
     assert np.mean(error > 3.0) < 0.01
     # Patches reach over outlines and bent surfaces, so that the largest errors are larger than Gaussian ones.
     squares = np.concatenate([pair.squares for pair in redrawn.pairs])
-    assert 0.9 * MEDIAN_SQUARE < np.median(squares) < 1.9 * MEDIAN_SQUARE
+    assert 0.6 * MEDIAN_SQUARE < np.median(squares) < 1.9 * MEDIAN_SQUARE
     assert np.mean(squares > 25.0) < 0.05
 
 

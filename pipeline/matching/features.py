@@ -112,8 +112,6 @@ def _strongest(parts: Sequence[Features], most: int) -> Features:
     full = [part for part in parts if len(part.pixels)]
     if not full:
         return Features.none()
-    if len(full) == 1:
-        return full[0]
     joined = Features(
         *(
             np.concatenate([getattr(part, name) for part in full])

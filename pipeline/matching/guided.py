@@ -42,6 +42,8 @@ def match_guided(ref_descriptors: Singles, src_descriptors: Singles, reach: Reac
     Returns:
         The matches, in order of the ref feature.
     """
+    if not (len(ref_descriptors) and len(src_descriptors)):
+        return FoundMatches(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
     ref_order = _usable_order(reach.ref)
     best = _Best(ref_descriptors, src_descriptors)
     for start in range(0, len(ref_order), _REF_BLOCK):

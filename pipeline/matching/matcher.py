@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import Bytes, Floats, Ints
@@ -27,6 +28,13 @@ class View:
     camera: Camera
     image: Bytes
     features: Features
+
+    @property
+    def grey(self) -> Bytes:
+        """(height, width): the image's luminance."""
+        if self.image.ndim == 2:
+            return self.image
+        return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,10 +64,11 @@ def match_pair(
     ref_px, src_px, variance = made.ref_px[keep], made.src_px[keep], made.variance_px2[keep]
     covariance = np.stack([variance, np.zeros_like(variance), variance], axis=1)
     good = np.ones(len(ref_px), np.bool_)
-    if subpixel and matcher.extractor is not None:
+    if subpixel:
         fitted = _fitted(ref_px, src_px, ref, src, pose, limits, up_in_ref)
-        good = fitted.refined
-        src_px[good], covariance[good] = fitted.src_px[good], fitted.covariance[good]
+        fits = fitted.refined
+        src_px[fits], covariance[fits] = fitted.src_px[fits], fitted.covariance[fits]
+        good = fits if matcher.extractor is not None else good
     good[good] = _agreeing(ref_px[good], src_px[good], covariance[good], ref, src, pose, limits)
     return PairMatches(ref_px, src_px, made.score[keep], covariance, good)
 
@@ -82,7 +83,7 @@ def _fitted(
     up_in_ref: Floats | None,
 ) -> Refined:
     warps = predicted_affines(ref_px, src_px, ref.camera, src.camera, pose, up_in_ref=up_in_ref)
-    return refine(ref.image, src.image, ref_px, src_px, warps, PatchSetting(limits.max_image_px))
+    return refine(ref.grey, src.grey, ref_px, src_px, warps, PatchSetting(limits.max_image_px))
 
 
 def _agreeing(

@@ -14,6 +14,9 @@ import kornia
 import numpy as np
 import torch
 from kornia.feature import XFeat
+from kornia.feature.xfeat import BasicLayer
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from pipeline.geometry.arrays import Bytes, Floats, Singles
 from pipeline.geometry.poses import RelativePose
@@ -55,12 +58,26 @@ class XFeatNetwork:
         """
         model = XFeat()
         strict_load(model.net, load_state(self.weights), self.weights)
-        return model.eval()
+        return _folded(model.eval())
 
     @property
     def batch(self) -> int:
         """Images that are best looked at together: a processor gains nothing by it."""
         return 1 if self.device.type == "cpu" else 8
+
+
+def _folded(model: XFeat) -> XFeat:
+    """The same function with each normalisation folded into its convolution, in the layout convolutions like best.
+
+    A third faster on a processor, and the same but for the last digits.
+    """
+    for layer in model.net.modules():
+        if isinstance(layer, BasicLayer):
+            convolution, normalisation, activation = layer.layer
+            if isinstance(convolution, nn.Conv2d) and isinstance(normalisation, nn.BatchNorm2d):
+                layer.layer = nn.Sequential(fuse_conv_bn_eval(convolution, normalisation), activation)
+    model.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return model
 
 
 @dataclass(frozen=True, slots=True)

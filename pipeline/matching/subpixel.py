@@ -36,12 +36,16 @@ _LARGEST_BEND, _LARGEST_BEND_STEP = 0.6, 0.3
 # Parameters of a patch: shift, warp, gain and offset.
 _PARAMETERS = 8
 _LEAST_NOISE_GREY = 1.0
+# Square of a central difference of slightly blurred white noise over the square of two images' difference.
+_NOISE_GRADIENT = 0.25
 # The covariance is _FORMAL times that of the normal equations, and _SCATTER times that of the patch's parts, and
-# _FLOOR_PX squared at each level. Fitted by likelihood together on photos warped by known homographies (noise of 2 grey
-# values, JPEG 90) and on the example flight's exact depths, for half sides of 5 to 12 pixels. The mean normalised
-# square is then 1.6 to 1.8 with homographies and 2.7 on the flight, where patches reach over outlines of trees and
-# roofs; 1 to 2 % of those lie beyond 5 sigma and are not in that mean.
-_FORMAL, _SCATTER, _FLOOR_PX = 0.5, 1.9, 0.01
+# _FLOOR_PX squared at each level. Their ratio was fitted by likelihood on photos warped by known homographies (noise of
+# 2 grey values, JPEG 90) and on the example flight's exact depths, for half sides of 5 to 12 pixels; their size lies
+# between what these need and what real photos of a wall and a fountain do (distances from the epipolar lines of the
+# pair's own pose). Mean normalised squares per axis, which should be 1: 0.5 with homographies; 1.0 on the flight, of
+# which 0.4 % lie beyond 5 sigma, on outlines of trees and roofs; 1.2 on the real photos, and 1.6 at twice the size
+# matched at.
+_FORMAL, _SCATTER, _FLOOR_PX = 0.65, 2.5, 0.012
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,8 @@ class PatchSetting:
     Args:
         matched_px: Longest side the images were matched at; the refinement starts there.
         finest_px: Longest side it ends at; larger images are shrunk to it.
-        half_px: Half the patch's side, without its middle pixel, at every level.
+        half_px: Half the patch's side, without its middle pixel, at the size matched at; at finer levels it grows
+            with the square root of the size.
         iterations: Most steps per level.
         blur_px: Sigma of the blur beforehand, which keeps the interpolation from biasing the position.
         bend_sigma: One sigma of the affine warp about the predicted one, per element (1).
@@ -77,6 +82,13 @@ class PatchSetting:
     def quick(cls, matched_px: int) -> PatchSetting:
         """Small patches, at the size matched at only."""
         return cls(matched_px, finest_px=matched_px, half_px=6, iterations=5)
+
+    def half_at(self, longest_px: int) -> int:
+        """Half the patch's side in a level whose longest side is this.
+
+        A larger patch tells more and costs more, and reaches over more of the scene's depths.
+        """
+        return round(self.half_px * max(1.0, longest_px / self.matched_px) ** 0.5)
 
     def sizes(self, width: int, height: int) -> list[tuple[int, int]]:
         """Widths and heights, coarse to fine, that an image is refined at."""
@@ -135,13 +147,13 @@ def refine(
     found = Refined.none(src_px)
     images = (ref_image, src_image)
     sizes = [setting.sizes(image.shape[1], image.shape[0]) for image in images]
-    window = Window.of(setting.half_px)
     for level in range(max(len(of) for of in sizes)):
         # An image with fewer levels stays at its own finest for the rest.
         ref, src = (
             Level.of(image, of[min(level, len(of) - 1)], setting.blur_px)
             for image, of in zip(images, sizes, strict=True)
         )
+        window = Window.of(setting.half_at(max(ref.grey.shape)))
         warps = [src.scale[:, None] * affine / ref.scale for affine in affines]
         for start in range(0, len(ref_px), _BLOCK):
             part = slice(start, start + _BLOCK)
@@ -251,7 +263,8 @@ def _covariance(patches: Patches, residual: Singles, warp: Floats) -> Floats:
     """Covariance of the positions in src, in the level's pixels.
 
     Neither the normal equations alone, which take every pixel's noise for its own, nor the scatter alone, which is
-    poor where a patch has few independent parts, tell the errors that happen; their sum does.
+    poor where a patch has few independent parts, tell the errors that happen; their sum does. Noise has gradients too,
+    which tell nothing: their share of the normal matrix is taken out, or a stripe's ends would seem to be known.
 
     Args:
         patches: Of ref.
@@ -261,12 +274,23 @@ def _covariance(patches: Patches, residual: Singles, warp: Floats) -> Floats:
     Returns:
         (n, 3) uu, uv, vv.
     """
-    count = patches.window.count
+    count, shift = patches.window.count, patches.inverse[:, :2, :2]
     noise = (residual * residual) @ patches.window.weights / (1.0 - _PARAMETERS / count)
-    formal = patches.inverse[:, :2, :2] * (np.maximum(noise, _LEAST_NOISE_GREY**2) / count)[:, None, None]
+    formal = shift * (np.maximum(noise, _LEAST_NOISE_GREY**2) / count)[:, None, None]
     in_ref = _FORMAL * formal + _SCATTER * _scatter(patches, residual)
+    told = inverse_2x2(shift)
+    true = told - (_NOISE_GRADIENT * noise)[:, None, None] * np.eye(2)
+    # Where nothing but noise is left, in one direction, nothing is known.
+    true[_worst(-_upper(true)) >= 0.0] = np.nan
+    more = inverse_2x2(true) @ told
+    in_ref = more @ in_ref @ more.transpose(0, 2, 1)
     full = warp @ in_ref @ warp.transpose(0, 2, 1) + _FLOOR_PX**2 * np.eye(2)
-    return np.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], axis=1)
+    return _upper(full)
+
+
+def _upper(symmetric: Floats) -> Floats:
+    """(n, 3) first, mixed and second element of (n, 2, 2)."""
+    return np.stack([symmetric[:, 0, 0], symmetric[:, 0, 1], symmetric[:, 1, 1]], axis=1)
 
 
 def _scatter(patches: Patches, residual: Singles) -> Floats:

@@ -124,5 +124,6 @@ def inverse_2x2(matrices: Floats) -> Floats:
     """(n, 2, 2) inverses; not finite for a singular one, for which numpy would refuse them all."""
     a, b, c, d = (matrices[:, i, j] for i in (0, 1) for j in (0, 1))
     adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
-    out: Floats = adjugate / (a * d - b * c)[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out: Floats = adjugate / (a * d - b * c)[:, None, None]
     return out

@@ -14,6 +14,7 @@ Lucas-Kanade 20 years on, IJCV 56 (3), 2004, for the inverse composition.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -88,13 +89,13 @@ class PatchSetting:
 
         A larger patch tells more and costs more, and reaches over more of the scene's depths.
         """
-        return round(self.half_px * max(1.0, longest_px / self.matched_px) ** 0.5)
+        return round(self.half_px * math.sqrt(max(1.0, longest_px / self.matched_px)))
 
     def sizes(self, width: int, height: int) -> list[tuple[int, int]]:
         """Widths and heights, coarse to fine, that an image is refined at."""
         fine = min(self.finest_px, max(width, height))
         coarse = min(self.matched_px, fine)
-        steps = int(np.ceil(np.log(fine / coarse) / np.log(_LEVEL_RATIO) - 1e-9))
+        steps = math.ceil(math.log(fine / coarse) / math.log(_LEVEL_RATIO) - 1e-9)
         longest = [round(coarse * (fine / coarse) ** (i / steps)) for i in range(steps)]
         return [shrunk_size(width, height, px) for px in (*longest, fine)]
 

@@ -2,8 +2,8 @@
 
 A ref pixel p at an inverse depth w is seen by src at M(p). With one w for the whole image the turn of the camera is
 gone, both lenses are, and what is left is the parallax of depths other than 1 / w. That w is the one, between
-infinity and the nearest range looked for, at which the two images look most alike. The pass over the whole image
-then finds F, so that p is seen by src at M(p + F(p)).
+infinity and the nearest range looked for, from which a quick look at small images explains most of them. The pass
+over the whole image then finds F, so that p is seen by src at M(p + F(p)).
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import numpy as np
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Singles
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.flow import FlowEstimator
+from pipeline.matching.flow import DisFlow, FlowEstimator
 from pipeline.matching.images import shrunk_size
 
-# The sweep over inverse depths: size of the images, px of parallax between two, and the window they are compared in.
-_SWEEP_PX, _SWEEP_STEP_PX, _MOST_STEPS, _WINDOW_PX = 160, 3.0, 48, 9
+# The sweep over inverse depths: size of the images, px of parallax between two of them, and the window in which images
+# are compared. So small, the search reaches over a step and over a pose wrong by some degrees besides.
+_SWEEP_PX, _SWEEP_STEP_PX, _MOST_STEPS, _WINDOW_PX = 160, 6.0, 24, 9
+_SWEEP = DisFlow(finest_scale=1)
 # Variance of grey values below which a window has nothing to compare.
 _FLAT = 4.0
 # The second pass sees src nearly as ref does, and finds what the first had to reach for.
 _PASSES = 2
-_CONSISTENT_PX = 1.5
-# OpenCV takes both coordinates as one array, and its stubs want a second one all the same.
-_NO_MAP = np.empty(0, np.float32)
+_CONSISTENT_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +157,15 @@ def resampled(src: Bytes, places: Floats, inside: Bools, ref: Bytes) -> Bytes:
     low = np.maximum(np.floor(places[inside].min(axis=0)).astype(int) - 2, 0)
     high = np.ceil(places[inside].max(axis=0)).astype(int) + 3
     piece = np.ascontiguousarray(src[low[1] : high[1], low[0] : high[0]])
-    at = np.where(inside[..., None], places - low, 0.0).astype(np.float32)
-    seen = cv2.remap(piece, at, _NO_MAP, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    seen = _taken(piece, np.where(inside[..., None], places - low, 0.0))
     return np.where(inside[..., None] if ref.ndim == 3 else inside, seen, ref).astype(np.uint8)
+
+
+def _taken(image: Bytes, places: Floats) -> Bytes:
+    """An image at places (h, w, 2) of it."""
+    # As two arrays: with the empty second one that its stubs ask for, OpenCV 5 takes other places.
+    u, v = (np.ascontiguousarray(places[..., i], np.float32) for i in (0, 1))
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def find_start(
@@ -186,13 +192,20 @@ def find_start(
         places = start.in_src(pixels, src.camera)
         inside = src.camera.holds(places)
         seen = resampled(src_image, places, inside, ref_image)
-        there, back = estimator.flows([(ref_image, seen), (seen, ref_image)])
-        landing = pixels + there
-        sure = inside & (np.linalg.norm(there + bilinear(back, landing), axis=-1) < _CONSISTENT_PX)
+        there, apart = _there_and_back(estimator, ref_image, seen)
+        sure = inside & (apart < _CONSISTENT_PX)
         step = _smoothed(there, sure)
         flow = step + bilinear(start.flow, pixels + step)
         start = Start(camera, pose, start.inverse_m, flow.astype(np.float32))
     return start
+
+
+def _there_and_back(estimator: FlowEstimator, ref: Bytes, seen: Bytes) -> tuple[Singles, Floats]:
+    """The motion (h, w, 2), and how far (h, w) the way there and back ends from where it began."""
+    there, back = estimator.flows([(ref, seen), (seen, ref)])
+    landing = pixel_grid(there.shape[1], there.shape[0]) + there
+    apart: Floats = np.linalg.norm(there + bilinear(back, landing), axis=-1)
+    return there, apart
 
 
 def _smoothed(flow: Singles, sure: Bools) -> Floats:
@@ -209,7 +222,7 @@ def _smoothed(flow: Singles, sure: Bools) -> Floats:
 
 
 def likeliest_inverse(ref: FlowView, src: FlowView, pose: RelativePose, nearest_m: float) -> float:
-    """The inverse depth at which small images of the two views look most alike.
+    """The inverse depth from which motion explains most of small images of the two views.
 
     Args:
         ref: The view whose pixels are asked for.
@@ -227,18 +240,26 @@ def likeliest_inverse(ref: FlowView, src: FlowView, pose: RelativePose, nearest_
     count = min(_MOST_STEPS, round(parallax_px / _SWEEP_STEP_PX)) + 1
     rays = ref.camera.rays(pixel_grid(ref.camera.width, ref.camera.height))
     candidates = np.linspace(0.0, largest, count)
-    scores = [_likeness(ref.image, src, seen_at(rays, pose, inverse, src.camera)) for inverse in candidates]
+    scores = [_explained(ref.image, src, seen_at(rays, pose, inverse, src.camera)) for inverse in candidates]
     return float(candidates[int(np.argmax(scores))])
 
 
-def _likeness(ref: Bytes, src: FlowView, places: Floats) -> float:
-    """How much more alike two images are than chance: the sum of local correlations over the root of their number."""
+def _explained(ref: Bytes, src: FlowView, places: Floats) -> float:
+    """How many pixels of ref are found in src from a start, each by how alike the two places look."""
     inside = src.camera.holds(places)
     if not inside.any():
-        return -np.inf
-    a, b = (i.astype(np.float32) for i in (ref, resampled(src.image, places, inside, np.zeros_like(ref))))
-    window = (_WINDOW_PX, _WINDOW_PX)
-    mean_a, mean_b, aa, bb, ab = (np.asarray(cv2.blur(i, window)) for i in (a, b, a * a, b * b, a * b))
-    spread = np.sqrt((aa - mean_a**2 + _FLAT).clip(_FLAT) * (bb - mean_b**2 + _FLAT).clip(_FLAT))
-    correlation = (ab - mean_a * mean_b) / spread
-    return float(correlation[inside].sum(dtype=np.float64) / np.sqrt(inside.sum()))
+        return 0.0
+    seen = resampled(src.image, places, inside, ref)
+    there, apart = _there_and_back(_SWEEP, ref, seen)
+    landing = pixel_grid(ref.shape[1], ref.shape[0]) + there
+    sure = inside & (apart < _CONSISTENT_PX) & (bilinear(inside[..., None].astype(np.float32), landing)[..., 0] > 0.99)
+    return float(_correlation(ref, _taken(seen, landing))[sure].sum(dtype=np.float64))
+
+
+def _correlation(a: Bytes, b: Bytes) -> Singles:
+    """(h, w): the correlation of two images in a window about each pixel."""
+    one, two = a.astype(np.float32), b.astype(np.float32)
+    products = (one, two, one * one, two * two, one * two)
+    mean_a, mean_b, aa, bb, ab = (np.asarray(cv2.blur(i, (_WINDOW_PX, _WINDOW_PX)), np.float32) for i in products)
+    spread = ((aa - mean_a**2).clip(0.0) + _FLAT) * ((bb - mean_b**2).clip(0.0) + _FLAT)
+    return np.asarray((ab - mean_a * mean_b) / np.sqrt(spread), np.float32)

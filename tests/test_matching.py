@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from feature_scenes import BAND, DEG, FLIGHTS, PLAIN, SMALL, STRONG, Scene, pose, scene
 from hypothesis import given
 from hypothesis import strategies as st
 from pixel_noise import drawn, slanted
+from plane_photos import plane_photos
 
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import Pose, RelativePose, relative_pose
+from pipeline.geometry.poses import RelativePose, relative_pose
 from pipeline.geometry.rotations import enu_from_cam
 from pipeline.matching.features import Features, extract
 from pipeline.matching.matcher import SearchLimits, View
@@ -154,50 +154,19 @@ def test_a_black_image_matches_nothing() -> None:
             assert found.covariance.shape == (0, 3)
 
 
-@dataclass(frozen=True)
-class Photographed:
-    """Two photos of a flat ground with a texture, and where ref's pixels are seen in src."""
-
-    ref: View
-    src: View
-    poses: tuple[Pose, Pose]
-    src_from_ref: Floats
-
-
-def photographed(rng: np.random.Generator, extractor: SiftExtractor) -> Photographed:
-    """From 30 m above, each texel 2 cm, with noise of two grey values."""
-    camera = Camera("pinhole", 800, 600, 700.0, 702.0, 401.0, 298.0)
-    ground = sum(
-        cv2.GaussianBlur(rng.normal(0.0, 60.0 * sigma, (3000, 3000)).astype(np.float32), (0, 0), sigma)
-        for sigma in (1.5, 4.0, 12.0)
-    )
-    ground_from_texel = np.array([[0.02, 0.0, -30.0], [0.0, -0.02, 30.0], [0.0, 0.0, 1.0]])
-    poses = pose((10, -80, 0), (2.0, 3.0, 30.0)), pose((14, -78, 3), (-1.5, 0.0, 31.0))
-    views, to_image = [], []
-    for of in poses:
-        plane = np.column_stack([of.rotation.T[:, :2], -of.rotation.T @ of.centre])
-        image_from_ground = camera.matrix @ plane
-        shown = cv2.warpPerspective(ground, image_from_ground @ ground_from_texel, (800, 600), flags=cv2.INTER_CUBIC)
-        grey = (128.0 + shown + rng.normal(0.0, 2.0, shown.shape)).round().clip(0, 255).astype(np.uint8)
-        views.append(View(camera, grey, extract(extractor, [grey])[0]))
-        to_image.append(image_from_ground)
-    return Photographed(*views, poses, to_image[1] @ np.linalg.inv(to_image[0]))
-
-
 def test_the_fit_of_the_patches_brings_a_match_nearer_and_knows_how_near() -> None:
     """Matched at half the size and fitted on the whole image, under poses with an error."""
     rng = np.random.default_rng(20)
     matcher = SiftMatcher(SiftExtractor(400, 1500), 0.85)
-    of = photographed(rng, matcher.extractor)
+    of = plane_photos(rng)
+    features = extract(matcher.extractor, of.images)
+    ref, src = (View(*parts) for parts in zip(of.cameras, of.images, features, strict=True))
     logged = relative_pose(*(replace(p, centre=p.centre + rng.normal(0.0, p.own.position_m)) for p in of.poses))
     limits = SearchLimits(BAND, 1.5, 400)
     median, share = {}, {}
     for subpixel in (False, True):
-        found = match_pair(
-            matcher, of.ref, of.src, logged, limits, up_in_ref=of.poses[0].rotation[2], subpixel=subpixel
-        )
-        there = np.column_stack([found.ref_px, np.ones(len(found.score))]) @ of.src_from_ref.T
-        error = (found.src_px - there[:, :2] / there[:, 2:])[found.inlier]
+        found = match_pair(matcher, ref, src, logged, limits, up_in_ref=of.poses[0].rotation[2], subpixel=subpixel)
+        error = of.errors(found.ref_px, found.src_px)[found.inlier]
         uu, uv, vv = found.covariance[found.inlier].T
         squares = (vv * error[:, 0] ** 2 - 2.0 * uv * error[:, 0] * error[:, 1] + uu * error[:, 1] ** 2) / (
             uu * vv - uv * uv

@@ -242,6 +242,20 @@ def test_pixels_do_not_depend_on_which_others_are_asked_for(ground: Plane) -> No
     assert dense.sample(np.empty((0, 2))).src_px.shape == (0, 2)
 
 
+def test_the_number_of_threads_changes_nothing(ground: Plane) -> None:
+    ref_px = grid_points(ground.ref.image, 500, 1600)
+    before = cv2.getNumThreads()
+    found = []
+    try:
+        for threads in (1, 3):
+            cv2.setNumThreads(threads)
+            found.append(matched(ground, DisFlow(tile_px=400), ref_px))
+    finally:
+        cv2.setNumThreads(before)
+    assert found[0].src_px.tobytes() == found[1].src_px.tobytes()
+    assert found[0].discrepancy_px.tobytes() == found[1].discrepancy_px.tobytes()
+
+
 def test_an_unrelated_image_is_not_consistent(ground: Plane) -> None:
     other = FlowView(grey(noise_image(640, 1000, 9)), ground.src.camera)
     ref_px = grid_points(ground.ref.image, 2000, 1600)

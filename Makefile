@@ -51,9 +51,14 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The networks' rows need weights: $EPITRANSFER_WEIGHTS, or `epitransfer models fetch`; real photo sets are looked for in
+# $EPITRANSFER_SHARED or ../shared. Some ten minutes on two cores; without either, two.
 bench: $(READY) example/workflow.toml
 	$(BIN)/python benchmarks/kernels.py
 	$(BIN)/python benchmarks/whole_path.py example
+	$(BIN)/python benchmarks/matchers.py example
+	$(BIN)/python benchmarks/vga_path.py example
+	$(BIN)/python benchmarks/raft_depth.py example
 
 # The flight from logs against the flight from stills, and logs of 1 and 5 GB; some ten minutes and 6 GB of disk.
 bench-logs: $(READY) example

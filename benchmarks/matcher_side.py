@@ -142,8 +142,8 @@ class Outcome:
     @classmethod
     def of(cls, stored: dict[str, Any]) -> Outcome:
         """As it was before it became JSON."""
-        worth = {name: Worth(**stored.pop(name)) for name in ("kept", "kept_fitted")}
-        return cls(**stored, **worth)
+        kept, kept_fitted = (Worth(**stored.pop(name)) for name in ("kept", "kept_fitted"))
+        return cls(kept=kept, kept_fitted=kept_fitted, **stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,14 +207,14 @@ def line_distances(ref_px: Floats, src_px: Floats, ref: Camera, src: Camera, pos
 
 def own_pose(ref_px: Floats, src_px: Floats, ref: Camera, src: Camera, threshold_rad: float) -> RelativePose | None:
     """The pose that matches agree on among themselves, the baseline of length 1; None where they are too few."""
-    planes = [camera.rays(pixels)[:, :2].copy() for camera, pixels in ((ref, ref_px), (src, src_px))]
+    in_ref, in_src = (camera.rays(pixels)[:, :2].copy() for camera, pixels in ((ref, ref_px), (src, src_px)))
     if len(ref_px) < 8:
         return None
-    matrix, mask = cv2.findEssentialMat(*planes, np.eye(3), cv2.USAC_MAGSAC, 0.9999, threshold_rad, 10_000)
+    matrix, mask = cv2.findEssentialMat(in_ref, in_src, np.eye(3), cv2.USAC_MAGSAC, 0.9999, threshold_rad, 10_000)
     if matrix is None or matrix.shape != (3, 3):
         return None
-    _, rotation, translation, _ = cv2.recoverPose(matrix, *planes, np.eye(3), mask=mask.copy())
-    return RelativePose(np.asarray(rotation), np.asarray(translation).ravel(), np.zeros((6, 6)))
+    _, rotation, translation, _ = cv2.recoverPose(matrix, in_ref, in_src, np.eye(3), mask=mask.copy())
+    return RelativePose(np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel(), np.zeros((6, 6)))
 
 
 def surfaces(truth: FlightTruth, frame_id: str, rays: Floats) -> Ints:
@@ -298,7 +298,7 @@ class Judge:
         self._depths(out, pair, (ref_px, src_px, matches.covariance[rows]), truth)
 
     def _depths(self, out: Worth, pair: PairRow, matches: tuple[Floats, Floats, Floats], truth: Floats) -> None:
-        config, cameras = DepthConfig(), self._cameras(pair)
+        config, cameras = DepthConfig.model_validate({}), self._cameras(pair)
         rays = MatchedRays.of(matches[0], matches[1], *cameras, matches[2])
         limits = Limits(config.max_relative_sigma, self._photos.max_range_m)
         view = VirtualView(config.virtual_view)
@@ -336,7 +336,7 @@ def outcome_of(task: Task) -> Outcome:
         weights = weights_of(task.matcher, None)
     except MissingPartError:
         return Outcome(missing="no weights")
-    outcome, photos, config = Outcome(), task.photos, MatchConfig()
+    outcome, photos, config = Outcome(), task.photos, MatchConfig.model_validate({})
     flight = Flight.of(photos.run)
     matcher = MatcherSetting(task.matcher, task.max_image_px, weights=weights).build([])
     band = Band(config.band_sigmas, config.sigma_px, photos.nearest_m)

@@ -236,7 +236,7 @@ class Example:
         """Depths of one pair's LiDAR pixels, by the poses they are found with; the flow is the same."""
         camera = self.flight.cameras[pair.ref]
         views = [FlowView(read_colour(self.flight.photos[name]), camera) for name in (pair.ref, pair.src)]
-        config = MatchConfig()
+        config = MatchConfig.model_validate({})
         limits = SearchLimits(
             Band(config.band_sigmas, config.sigma_px, config.nearest_m), config.consensus_px, longest_px
         )
@@ -261,7 +261,7 @@ class Example:
         # As the dense matcher has it.
         variance = limits.prior_variance(camera, camera) + 0.5 * (missed * limits.shrink(camera)) ** 2
         covariance = np.stack([variance, np.zeros_like(variance), variance], axis=1)
-        rays, config = MatchedRays.of(ref_px, src_px, camera, camera, covariance), DepthConfig()
+        rays, config = MatchedRays.of(ref_px, src_px, camera, camera, covariance), DepthConfig.model_validate({})
         kept_by = Limits(config.max_relative_sigma, config.max_range_m)
         depths = {
             name: depths_by(name, VirtualView.ADAPTIVE, config.virtual_baseline_m, rays, pose, kept_by)

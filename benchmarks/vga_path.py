@@ -129,7 +129,7 @@ class Half:
     def __init__(self, job: Job) -> None:
         cv2.setNumThreads(1)
         self.spent = Spent()
-        self._job, self._flight, config = job, Flight.of(job.run), MatchConfig()
+        self._job, self._flight, config = job, Flight.of(job.run), MatchConfig.model_validate({})
         self._images: dict[str, Bytes] = {}
         self._cameras: dict[str, Camera] = {}
         for name in job.names:
@@ -162,7 +162,7 @@ class Half:
             rays = MatchedRays.of(
                 pixels, found.src_px[found.inlier], view.camera, before.camera, found.covariance[found.inlier]
             )
-            config = DepthConfig()
+            config = DepthConfig.model_validate({})
             limits = Limits(config.max_relative_sigma, config.max_range_m)
             depths = depths_by("epitransfer", VirtualView.ADAPTIVE, config.virtual_baseline_m, rays, pose, limits)
             self.spent.cpu_s["depths"] += time.process_time() - between

@@ -108,10 +108,10 @@ def first_table(done: list[tuple[PhotoSet, dict[str, Future[Outcome]]]]) -> dict
         found[photos.name] = {name: future.result() for name, future in futures.items()}
         for line in block(photos, found[photos.name]):
             print(line, flush=True)
-    print("* Nothing else is known of these: that matches agree says little of the poses, and nothing of ranges.")
-    print(
-        "The poses of hololens, by the headset's tracking, are good to 1 px; those of fountain_p11, by laser, to 0.3."
-    )
+    if any(photos.poses == LOGGED for photos, _ in done):
+        print("* Nothing else is known of these: that matches agree says little of the poses, and nothing of ranges.")
+    if any(photos.poses == EXACT for photos, _ in done):
+        print("The sets' own poses: hololens's, by the headset's tracking, are good to 1 px; fountain_p11's to 0.3 px.")
     return found
 
 
@@ -121,7 +121,7 @@ def second_table(found: dict[str, Outcomes]) -> None:
     print(f"  near   of those with a truth, within {NEAR_SHARE:.0%} of it")
     if real := LOW_TEXTURE[1] in found:
         print(f"  {LOW_TEXTURE[1]} is the real set with the fewest SIFT matches for its pixels: sand, grass and water")
-    print(f"\n  {'':18}{LOW_TEXTURE[0]:>14}{'':48}{LOW_TEXTURE[1] if real else '':>16}")
+    print(f"\n  {'':18}{LOW_TEXTURE[0]:>14}" + (f"{'':48}{LOW_TEXTURE[1]:>16}" if real else ""))
     print(
         f"  {'':18}{'all':>7}{'x':>7}{'near':>8}{LAWN:>8}{'x':>7}{ROOF:>8}{'x':>7}{REST:>8}{'x':>7}"
         + (f"{'all':>9}{'x':>7}" if real else "")

@@ -297,16 +297,16 @@ def lidar_table(example: Path, flows: Mapping[str, FlowEstimator | None]) -> Non
         print("  common  of the pixels, where both methods keep the depth and the way back agrees")
         print(f"  unmasked depths are all in src, clipped to {MAX_RANGE_M:g} m; each: AbsRel and share within 1.25\n")
         print(
-            f"  {'':31}{'flow px':>16}{'':7}{'DLT, common':>17}{'adaptive, common':>18}"
-            f"{'DLT, unmasked':>17}{'adaptive':>16}"
+            f"  {'':27}{'flow px':>14}{'':8}{'DLT, common':>15}{'adaptive, common':>17}"
+            f"{'DLT, unmasked':>15}{'adaptive':>15}"
         )
         print(
-            f"  {'':16}{'pixels':>7}{'in src':>8}{'median':>8}{'90 %':>8}{'common':>7}"
-            + "".join(f"{'AbsRel':>{width}}{'d1':>8}" for width in (9, 10, 9, 8))
+            f"  {'':12}{'pixels':>8}{'in src':>7}{'median':>7}{'90 %':>7}{'common':>8}"
+            + "".join(f"{'AbsRel':>{width}}{'d1':>7}" for width in (8, 10, 8, 8))
         )
         for name, estimator in flows.items():
             if estimator is None:
-                print(f"  {name:16}no weights")
+                print(f"  {name:12}no weights")
                 continue
             found = [scene.scored(pair, estimator, MATCHED_PX[name]) for pair in pairs]
             for poses in (LOGGED, TRUE):
@@ -320,11 +320,11 @@ def row(title: str, some: Scored) -> str:
     cells = [some.depth_m[name][common] / some.lidar_m[common] for name in METHODS]
     cells += [clipped(some.depth_m[name]) / some.lidar_m for name in METHODS]
     return (
-        f"  {title:16}{some.asked:7}{len(some.lidar_m) / some.asked:8.1%}{np.median(missed):8.2f}"
-        f"{np.quantile(missed, 0.9):8.2f}{common.sum() / some.asked:7.1%}"
+        f"  {title:12}{some.asked:8,}{len(some.lidar_m) / some.asked:7.1%}{np.median(missed):7.2f}"
+        f"{np.quantile(missed, 0.9):7.2f}{common.sum() / some.asked:8.1%}"
         + "".join(
-            f"{np.mean(np.abs(ratio - 1.0)):{width}.4f}{np.mean((ratio < DELTA_BASE) & (ratio > 1 / DELTA_BASE)):8.1%}"
-            for ratio, width in zip(cells, (9, 10, 9, 8), strict=True)
+            f"{np.mean(np.abs(ratio - 1.0)):{width}.4f}{np.mean((ratio < DELTA_BASE) & (ratio > 1 / DELTA_BASE)):7.1%}"
+            for ratio, width in zip(cells, (8, 10, 8, 8), strict=True)
         )
     )
 

@@ -42,15 +42,16 @@ from pipeline.lidar.heightfield import HeightField, return_spacing_m  # noqa: E4
 from pipeline.lidar.nearby import LocalTiles, returns_near  # noqa: E402
 from pipeline.lidar.tiles import expand, read_tile  # noqa: E402
 from pipeline.lidar.visibility import View, visible_returns  # noqa: E402
-from pipeline.matching.flow import DisFlow, FlowEstimator, RaftFlow  # noqa: E402
-from pipeline.matching.flow_field import DenseMatches, FlowSetting, dense_field  # noqa: E402
-from pipeline.matching.flow_start import FlowView  # noqa: E402
+from pipeline.matching.flow.estimators import DisFlow, FlowEstimator  # noqa: E402
+from pipeline.matching.flow.field import DenseMatches, FlowSetting, dense_field  # noqa: E402
+from pipeline.matching.flow.raft import raft_from_state  # noqa: E402
+from pipeline.matching.flow.raft_flow import RaftFlow  # noqa: E402
+from pipeline.matching.flow.start import FlowView  # noqa: E402
 from pipeline.matching.images import read_colour  # noqa: E402
 from pipeline.matching.matcher import SearchLimits  # noqa: E402
 from pipeline.matching.matchers import weights_of  # noqa: E402
-from pipeline.matching.raft import raft_from_state  # noqa: E402
 from pipeline.matching.reach import Band  # noqa: E402
-from pipeline.matching.weights import load_state  # noqa: E402
+from pipeline.matching.weights.files import load_state  # noqa: E402
 from pipeline.scoring.metrics import DELTA_BASE  # noqa: E402
 from stages.depth import Config as DepthConfig  # noqa: E402
 from stages.match import Config as MatchConfig  # noqa: E402

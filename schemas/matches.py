@@ -17,7 +17,9 @@ MATCHES = TableSchema(
         single("cov_uv", "px^2", "Covariance of src_u and src_v.", frame="image"),
         single("cov_vv", "px^2", "Variance of src_v.", frame="image"),
         flag(
-            "inlier", "Agrees with the logged pose within its covariance and with the epipolar geometry of the matches."
+            "inlier",
+            "Its patches fit, and it agrees with the logged pose within its covariance and with the epipolar geometry of "
+            "the matches.",
         ),
     ),
 )

@@ -17,8 +17,8 @@ from pipeline.clocks.gps import TABLE_HOLDS_UNTIL
 from pipeline.engine.errors import MissingPartError, UndeterminedError
 from pipeline.engine.executors import usable_cores
 from pipeline.geodesy.heights import Geoid
-from pipeline.matching.known_weights import NETWORKS_OF
-from pipeline.matching.weights import find_weights
+from pipeline.matching.weights.files import find_weights
+from pipeline.matching.weights.known import NETWORKS_OF
 
 REQUIRED = (
     "numpy",

@@ -12,8 +12,7 @@ import typer
 
 from pipeline.engine.errors import InputError, UsageError
 from pipeline.engine.progress import Reporter
-from pipeline.matching.known_weights import KNOWN, KnownWeights, matchers_of
-from pipeline.matching.weights import (
+from pipeline.matching.weights.files import (
     CONFIGURED,
     VARIABLE,
     FoundWeights,
@@ -24,6 +23,7 @@ from pipeline.matching.weights import (
     no_such_file,
     weight_places,
 )
+from pipeline.matching.weights.known import KNOWN, KnownWeights, matchers_of
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
 
@@ -91,7 +91,7 @@ def fetch(
     ] = None,
 ) -> None:
     """Fetches weights, and keeps what has the right digest."""
-    from pipeline.matching.fetching import fetch as fetch_files  # noqa: PLC0415 - slow, and needed here only
+    from pipeline.matching.weights.fetching import fetch as fetch_files  # noqa: PLC0415 - slow, and needed here only
 
     if bool(names) == everything:
         raise UsageError("E-WEIGHTS-10", "name networks or files, or --all", expected=_choices())

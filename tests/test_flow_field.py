@@ -24,11 +24,12 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.geometry.transfer import VirtualView, transfer
-from pipeline.matching.flow import DisFlow, FlowEstimator, ImagePair, RaftFlow
-from pipeline.matching.flow_field import DenseMatches, FlowSetting, dense_field
-from pipeline.matching.flow_start import FlowView, bilinear, likeliest_inverse, pixel_grid, resampled, seen_at
-from pipeline.matching.grid_points import grid_points
-from pipeline.matching.raft import SMALL, Raft, raft_from_state
+from pipeline.matching.flow.estimators import DisFlow, FlowEstimator, ImagePair
+from pipeline.matching.flow.field import DenseMatches, FlowSetting, dense_field
+from pipeline.matching.flow.grid_points import grid_points
+from pipeline.matching.flow.raft import SMALL, Raft, raft_from_state
+from pipeline.matching.flow.raft_flow import RaftFlow
+from pipeline.matching.flow.start import FlowView, bilinear, likeliest_inverse, pixel_grid, resampled, seen_at
 
 SETTING = FlowSetting(1600, 5.0)
 
@@ -457,8 +458,8 @@ from pathlib import Path
 import cv2, numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.flow import DisFlow
-from pipeline.matching.flow_field import FlowSetting, FlowView, dense_field
+from pipeline.matching.flow.estimators import DisFlow
+from pipeline.matching.flow.field import FlowSetting, FlowView, dense_field
 peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
 cv2.setNumThreads(1)
 width, height = 11600, 8700

@@ -19,9 +19,10 @@ from weight_server import Served, serving
 
 from pipeline.engine.errors import EpiTransferError, InputError, ResourceError
 from pipeline.engine.progress import Reporter
-from pipeline.matching import fetching, weights
-from pipeline.matching.fetching import fetch
-from pipeline.matching.known_weights import KnownWeights
+from pipeline.matching.weights import fetching
+from pipeline.matching.weights import files as weights
+from pipeline.matching.weights.fetching import fetch
+from pipeline.matching.weights.known import KnownWeights
 from stages import models
 
 CONTENT = bytes(range(256)) * 2048  # 512 KiB: several blocks, so that a cut one leaves something
@@ -264,7 +265,7 @@ def test_a_full_disk_is_told_with_the_file(net: KnownWeights, cache: Path) -> No
     """A limit on the size of files stands for the disk."""
     code = (
         "import resource, sys; from pathlib import Path; from stages import app, models\n"
-        "from pipeline.matching.known_weights import KnownWeights\n"
+        "from pipeline.matching.weights.known import KnownWeights\n"
         f"models.KNOWN = (KnownWeights('xfeat', 'xfeat.pt', {net.sha256!r}, None, '', '', {net.url!r}),)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))\n"
         f"sys.exit(app.run(['models', 'fetch', 'xfeat', '--to', {str(cache)!r}]))"

@@ -16,7 +16,7 @@ from known_motion import HOMOGRAPHIES, endpoint_error, moved_by, noise_image
 from pipeline.engine.errors import InputError, ResourceError, UsageError
 from pipeline.geometry.arrays import Bytes, Floats
 from pipeline.matching.devices import choose_device, in_batches
-from pipeline.matching.raft import LARGE, SMALL, Raft, RaftKind, raft_from_state
+from pipeline.matching.flow.raft import LARGE, SMALL, Raft, RaftKind, raft_from_state
 
 
 @pytest.fixture(scope="module")

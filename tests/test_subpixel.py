@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from pipeline.geometry.arrays import Bytes, Floats
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.images import read_grey
-from pipeline.matching.patches import Level, Window
-from pipeline.matching.subpixel import PatchSetting, Refined, refine
-from pipeline.matching.warps import predicted_affines
+from pipeline.matching.patches.patch import Level, Window
+from pipeline.matching.patches.subpixel import PatchSetting, Refined, refine
+from pipeline.matching.patches.warps import predicted_affines
 
 WIDTH, HEIGHT = 320, 240
 PLAIN = PatchSetting(WIDTH)

@@ -12,7 +12,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.rotations import rotation_from_vector
-from pipeline.matching.warps import inverse_2x2, plane_affines, predicted_affines
+from pipeline.matching.patches.warps import inverse_2x2, plane_affines, predicted_affines
 
 PLAIN = Camera("pinhole", 1600, 1200, 1120.0, 1118.0, 803.0, 595.0)
 BROWN = Camera("brown", 1600, 1200, 1121.0, 1119.0, 803.0, 595.0, (-0.12, 0.03, 0.001, -0.0008, 0.0))

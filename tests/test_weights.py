@@ -16,9 +16,8 @@ import safetensors.torch
 import torch
 
 from pipeline.engine.errors import InputError, MissingPartError
-from pipeline.matching import weights
-from pipeline.matching.known_weights import KNOWN, NETWORKS_OF, KnownWeights, matchers_of
-from pipeline.matching.weights import (
+from pipeline.matching.weights import files as weights
+from pipeline.matching.weights.files import (
     FoundWeights,
     find_weights,
     identified,
@@ -28,6 +27,7 @@ from pipeline.matching.weights import (
     weight_places,
     wrong_network,
 )
+from pipeline.matching.weights.known import KNOWN, NETWORKS_OF, KnownWeights, matchers_of
 
 BY_FILE = {known.file: known for known in KNOWN}
 

@@ -23,7 +23,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # Of the pieces that an image too large for one is cut into: wider than what a feature looks at.
-TILE_PX, TILE_MARGIN_PX = 2560, 128
+TILE_PX, TILE_MARGIN_PX = 2048, 128
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.matching.known_weights import NETWORKS_OF
+from pipeline.matching.flow.estimators import DisFlow
+from pipeline.matching.flow.matcher import DenseMatcher
 from pipeline.matching.matcher import Matcher
 from pipeline.matching.sift import SiftExtractor, SiftMatcher
-from pipeline.matching.weights import FoundWeights, find_weights
+from pipeline.matching.weights.files import FoundWeights, find_weights
+from pipeline.matching.weights.known import NETWORKS_OF
 
 DENSE = ("raft", "dis")
 # Most features of an image: what a matcher takes in its stride.
@@ -54,6 +56,8 @@ class MatcherSetting:
         ratio = self.ratio or _RATIO.get(self.name, 1.0)
         if self.name == "sift":
             return SiftMatcher(SiftExtractor(self.max_image_px, most), ratio)
+        if self.name == "dis":
+            return DenseMatcher(DisFlow(), most)
         # Whoever matches without a network should not wait for torch.
         from pipeline.matching.networks import build  # noqa: PLC0415
 

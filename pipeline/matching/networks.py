@@ -1,4 +1,4 @@
-"""Building the matchers that need torch or optical flow."""
+"""Building the matchers that are networks."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pipeline.matching.dense import DenseMatcher
-from pipeline.matching.flow import DisFlow, RaftFlow
-from pipeline.matching.lighterglue import LighterGlueMatcher, LighterGlueNetwork
+from pipeline.matching.flow.matcher import DenseMatcher
+from pipeline.matching.flow.raft import raft_from_state
+from pipeline.matching.flow.raft_flow import RaftFlow
 from pipeline.matching.matcher import Matcher
-from pipeline.matching.raft import raft_from_state
-from pipeline.matching.weights import load_state
-from pipeline.matching.xfeat import XFeatExtractor, XFeatMatcher, XFeatNetwork
-from pipeline.matching.xfeat_star import StarExtractor, StarMatcher
+from pipeline.matching.weights.files import load_state
+from pipeline.matching.xfeat.lighterglue import LighterGlueMatcher, LighterGlueNetwork
+from pipeline.matching.xfeat.network import XFeatNetwork
+from pipeline.matching.xfeat.sparse import XFeatExtractor, XFeatMatcher
+from pipeline.matching.xfeat.star import StarExtractor, StarMatcher
 
 # Pieces of an image that a GPU looks at together.
 _GPU_BATCH = 4
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def build(setting: MatcherSetting, max_features: int, ratio: float, notes: list[str]) -> Matcher:
-    """A matcher that is not SIFT.
+    """A matcher that is a network, or built on one.
 
     Args:
         setting: With the name, the size images are matched at, the weights and the device.
@@ -32,8 +33,6 @@ def build(setting: MatcherSetting, max_features: int, ratio: float, notes: list[
         notes: Where networks write what the user should be told.
     """
     device = torch.device(setting.device)
-    if setting.name == "dis":
-        return DenseMatcher(DisFlow(), max_features)
     if setting.name == "raft":
         (weights,) = setting.weights
         network = raft_from_state(load_state(weights)).eval()

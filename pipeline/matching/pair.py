@@ -13,10 +13,10 @@ import numpy as np
 from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.matcher import Matcher, SearchLimits, View
+from pipeline.matching.patches.subpixel import PatchSetting, Refined, refine
+from pipeline.matching.patches.warps import predicted_affines
 from pipeline.matching.reach import rays_in_ref
-from pipeline.matching.subpixel import PatchSetting, Refined, refine
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
-from pipeline.matching.warps import predicted_affines
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def match_pair(
         pose: src_from_ref with its covariance.
         limits: Of the search.
         up_in_ref: (3,) the vertical on the ref camera's axes; level ground is then one guess at a patch's surface.
-        subpixel: Whether the matches of a sparse matcher are moved to where their patches fit, or refused.
+        subpixel: Whether matches are moved to where their patches fit, and refused where these do not.
     """
     made = matcher.candidates(ref, src, pose, limits)
     keep = without_duplicates(made.ref_px, made.src_px, made.score)
@@ -66,9 +66,8 @@ def match_pair(
     good = np.ones(len(ref_px), np.bool_)
     if subpixel:
         fitted = _fitted(ref_px, src_px, ref, src, pose, limits, up_in_ref)
-        fits = fitted.refined
-        src_px[fits], covariance[fits] = fitted.src_px[fits], fitted.covariance[fits]
-        good = fits if matcher.extractor is not None else good
+        good = fitted.refined
+        src_px[good], covariance[good] = fitted.src_px[good], fitted.covariance[good]
     good[good] = _agreeing(ref_px[good], src_px[good], covariance[good], ref, src, pose, limits)
     return PairMatches(ref_px, src_px, made.score[keep], covariance, good)
 

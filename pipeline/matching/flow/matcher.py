@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.flow import FlowEstimator
-from pipeline.matching.flow_field import FlowSetting, dense_field
-from pipeline.matching.flow_start import FlowView
-from pipeline.matching.grid_points import grid_points
+from pipeline.matching.flow.estimators import FlowEstimator
+from pipeline.matching.flow.field import FlowSetting, dense_field
+from pipeline.matching.flow.grid_points import grid_points
+from pipeline.matching.flow.start import FlowView
 from pipeline.matching.matcher import Candidates, SearchLimits, View
 
 # Where the way there and back misses by more, the point is hidden in src, or nothing was found.

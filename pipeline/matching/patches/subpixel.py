@@ -22,8 +22,8 @@ import numpy as np
 
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Ints, Singles
 from pipeline.matching.images import shrunk_size
-from pipeline.matching.patches import Level, Patches, Window
-from pipeline.matching.warps import inverse_2x2
+from pipeline.matching.patches.patch import Level, Patches, Window
+from pipeline.matching.patches.warps import inverse_2x2
 
 # Matches per block: enough to hide the calls' own cost, few enough for the caches.
 _BLOCK = 256

@@ -15,8 +15,8 @@ import numpy as np
 from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Ints, Singles
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.flow import FlowEstimator
-from pipeline.matching.flow_start import FlowView, Start, bilinear, find_start, resampled
+from pipeline.matching.flow.estimators import FlowEstimator
+from pipeline.matching.flow.start import FlowView, Start, bilinear, find_start, resampled
 from pipeline.matching.images import to_full_pixels
 from pipeline.matching.tiles import Tile, tiles
 

@@ -19,7 +19,8 @@ from pipeline.matching.devices import in_batches
 from pipeline.matching.features import Features
 from pipeline.matching.guided import match_guided
 from pipeline.matching.matcher import Candidates, SearchLimits, View
-from pipeline.matching.xfeat import XFeatNetwork, padded, unit
+from pipeline.matching.xfeat.network import XFeatNetwork, padded
+from pipeline.matching.xfeat.sparse import unit
 
 # The scales the image is looked at, and each one's share of the features (the paper's).
 _SCALES = ((0.6, 0.2), (1.3, 0.8))

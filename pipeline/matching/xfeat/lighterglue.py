@@ -20,8 +20,8 @@ from pipeline.matching.devices import in_batches
 from pipeline.matching.features import Features
 from pipeline.matching.matcher import Candidates, SearchLimits, View
 from pipeline.matching.reach import Reach
-from pipeline.matching.weights import FoundWeights, load_state, strict_load, wrong_network
-from pipeline.matching.xfeat import XFeatExtractor
+from pipeline.matching.weights.files import FoundWeights, load_state, strict_load, wrong_network
+from pipeline.matching.xfeat.sparse import XFeatExtractor
 
 _REF_BLOCK = 256
 # The similarity of pairs out of reach: next to no probability, and still a number.

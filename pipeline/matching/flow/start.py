@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Singles
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.flow import DisFlow, FlowEstimator
+from pipeline.matching.flow.estimators import DisFlow, FlowEstimator
 from pipeline.matching.images import shrunk_size
 
 # The sweep over inverse depths: size of the images, px of parallax between two of them, and the window in which images

@@ -18,7 +18,7 @@ import platformdirs
 
 from pipeline.engine.digests import digest_file
 from pipeline.engine.errors import InputError, MissingPartError
-from pipeline.matching.known_weights import KNOWN, KnownWeights
+from pipeline.matching.weights.known import KNOWN, KnownWeights
 
 if TYPE_CHECKING:
     import torch

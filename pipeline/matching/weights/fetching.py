@@ -18,7 +18,7 @@ import requests
 from pipeline.engine.digests import digest_file
 from pipeline.engine.errors import InputError, ResourceError
 from pipeline.engine.progress import Reporter
-from pipeline.matching.known_weights import KnownWeights
+from pipeline.matching.weights.known import KnownWeights
 
 _BLOCK = 1 << 16
 _CONNECT_S, _READ_S = 15.0, 60.0

@@ -1,0 +1,1 @@
+"""Dense flow under a known pose, by RAFT or by DIS."""

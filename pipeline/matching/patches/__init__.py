@@ -1,0 +1,1 @@
+"""The fit of small patches: sub-pixel positions and their covariance."""

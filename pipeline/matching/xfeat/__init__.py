@@ -1,0 +1,1 @@
+"""XFeat and the two matchers that are built on it."""

@@ -45,7 +45,8 @@ class Config(StageConfig):
         description="Largest ratio of best to second-best distance in the band; the matcher's own (1)",
     )
     subpixel: bool = Field(
-        True, description="Whether matches are fitted on the full image, each with its own covariance; what does not fit is none"
+        True,
+        description="Whether matches are fitted on the full image, each with its own covariance; what does not fit is none",
     )
     weights: str | tuple[str, ...] | None = Field(
         None,

@@ -48,8 +48,10 @@ def part(scale: float, items: Sequence[int]) -> pa.Table:
     rng = np.random.default_rng(list(items))
     n = len(items)
     pixels = {name: rng.normal(size=n) * scale for name in ("ref_u", "ref_v", "src_u", "src_v")}
-    score = np.ones(n, np.float32)
-    return MATCHES.from_columns({"pair_id": [str(i) for i in items], **pixels, "score": score, "inlier": [True] * n})
+    one = np.ones(n, np.float32)
+    covariance = dict.fromkeys(("cov_uu", "cov_uv", "cov_vv"), one)
+    known = {"pair_id": [str(i) for i in items], "score": one, "inlier": [True] * n}
+    return MATCHES.from_columns({**known, **pixels, **covariance})
 
 
 def use(config: UseConfig, context: Context) -> str:

@@ -6,6 +6,7 @@ Pixel (0, 0) is the centre of the top-left pixel. Rays are in the camera's right
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -280,6 +281,7 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     return float(np.min(real[real > 0.0], initial=np.inf))
 
 
+@lru_cache(maxsize=64)
 def _brown_fold(coefficients: tuple[float, ...]) -> float:
     """Where the derivative of r * top / bottom, or bottom, first is 0; both are polynomials in r^2."""
     k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, *([0.0] * 8))[:8]
@@ -290,6 +292,7 @@ def _brown_fold(coefficients: tuple[float, ...]) -> float:
     return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
 
 
+@lru_cache(maxsize=64)
 def _fisheye_fold(coefficients: tuple[float, ...]) -> float:
     """The tangent of the angle at which theta_d stops growing; infinite from 90 deg on."""
     k1, k2, k3, k4 = (*coefficients, *([0.0] * 4))[:4]

@@ -121,8 +121,7 @@ class Outcome:
         images: Photos that features were found in; 0 for a dense matcher.
         made: Matches, duplicates left out.
         fitted: Those whose patches fit.
-        kept: Those that fit where they have to, and agree with the pose and with one another.
-        kept_fitted: Of these, those whose patches fit; a sparse matcher's all do.
+        kept: Those that fit, and agree with the pose and with one another.
         image_s: CPU time per photo: its features.
         pair_s: CPU time per pair: candidates, fit of the patches, checks.
         memory_mib: Most memory of the process.
@@ -134,7 +133,6 @@ class Outcome:
     made: int = 0
     fitted: int = 0
     kept: Worth = field(default_factory=Worth)
-    kept_fitted: Worth = field(default_factory=Worth)
     image_s: float = 0.0
     pair_s: float = 0.0
     memory_mib: float = 0.0
@@ -142,8 +140,7 @@ class Outcome:
     @classmethod
     def of(cls, stored: dict[str, Any]) -> Outcome:
         """As it was before it became JSON."""
-        kept, kept_fitted = (Worth(**stored.pop(name)) for name in ("kept", "kept_fitted"))
-        return cls(kept=kept, kept_fitted=kept_fitted, **stored)
+        return cls(kept=Worth(**stored.pop("kept")), **stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +241,7 @@ class Judge:
     def __init__(self, photos: PhotoSet, flight: Flight, limits: SearchLimits) -> None:
         self._photos, self._flight, self._limits = photos, flight, limits
         self._truth = FlightTruth(photos.truth) if photos.truth else None
-        self._errors: dict[int, list[Floats]] = {}
+        self._errors: list[Floats] = []
 
     def add(self, found: Found, out: Outcome) -> None:
         """One more pair."""
@@ -255,17 +252,14 @@ class Judge:
         out.pair_s += found.cpu_s
         out.made += len(matches.score)
         out.fitted += int(fitted.sum())
-        pose = self._true_pose(pair, matches, matches.inlier & fitted)
-        for worth, rows in ((out.kept, matches.inlier), (out.kept_fitted, matches.inlier & fitted)):
-            self._add(worth, pair, pose, matches, rows)
+        self._add(out.kept, pair, self._true_pose(pair, matches, matches.inlier), matches, matches.inlier)
 
     def finish(self, out: Outcome) -> None:
         """The medians of all pairs."""
-        for worth in (out.kept, out.kept_fitted):
-            errors = np.concatenate(self._errors.get(id(worth), [np.empty(0)]))
-            errors = errors[np.isfinite(errors)]
-            if len(errors):
-                worth.error_px = (float(np.median(errors)), float(np.quantile(errors, 0.9)))
+        errors = np.concatenate([np.empty(0), *self._errors])
+        errors = errors[np.isfinite(errors)]
+        if len(errors):
+            out.kept.error_px = (float(np.median(errors)), float(np.quantile(errors, 0.9)))
         out.pair_s /= max(1, out.pairs)
         out.image_s /= max(1, out.images)
 
@@ -294,7 +288,7 @@ class Judge:
             truth = self._truth.depths(pair.ref, ref_px)
             poses = {"ref": self._truth.poses[pair.ref], "src": self._truth.poses[pair.src]}
             error = np.linalg.norm(reprojection_errors(ref_px, src_px, truth, cameras[0], **poses), axis=1)
-            self._errors.setdefault(id(out), []).append(error)
+            self._errors.append(error)
         self._depths(out, pair, (ref_px, src_px, matches.covariance[rows]), truth)
 
     def _depths(self, out: Worth, pair: PairRow, matches: tuple[Floats, Floats, Floats], truth: Floats) -> None:

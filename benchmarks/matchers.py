@@ -78,8 +78,6 @@ def block(photos: PhotoSet, found: Outcomes) -> Iterator[str]:
             f"  {name:18}{out.made / out.pairs:7,.0f} {share(out.fitted, out.made)}{worth(out.kept, out.pairs, mark)}"
             f"{image}{out.pair_s:9.2f}{times(out.pair_s, found[FIRST].pair_s)}{out.memory_mib:7.0f}"
         )
-        if out.kept_fitted.matches != out.kept.matches:
-            yield f"    {'of them fitted':16}{'':14}{worth(out.kept_fitted, out.pairs, mark)}"
 
 
 def worth(kept: Worth, pairs: int, mark: str) -> str:
@@ -92,7 +90,7 @@ def first_table(done: list[tuple[PhotoSet, dict[str, Future[Outcome]]]]) -> dict
     """Prints the first table, set by set as they are done; returns the outcomes by set and matcher."""
     print("Matches of the same pairs under the logged poses, per pair")
     print("  made   matches, duplicates left out")
-    print("  fit    of those made, whose patches fit: only these are kept of a sparse matcher")
+    print("  fit    of those made, whose patches fit: only these are kept")
     print("  kept   also agree with the pose within its error, and with one another")
     print(f"  right  of these, within {RIGHT_PX:g} px (at the size matched at) of the epipolar line by the pose named")
     print("  px     distance of those kept from the true place, px of the photo as given: median and 90 %")
@@ -132,11 +130,6 @@ def second_table(found: dict[str, Outcomes]) -> None:
             print(f"  {name:18}{out.missing}")
             continue
         print(f"  {name:18}" + low_cells(out.kept, out, lawn[FIRST]) + (real_cells(name, other) if other else ""))
-        if out.kept_fitted.matches != out.kept.matches:
-            cells = low_cells(out.kept_fitted, out, lawn[FIRST]) + (
-                real_cells(name, other, fitted=True) if other else ""
-            )
-            print(f"    {'of them fitted':16}{cells}")
 
 
 def low_cells(kept: Worth, out: Outcome, base: Outcome) -> str:
@@ -149,11 +142,10 @@ def low_cells(kept: Worth, out: Outcome, base: Outcome) -> str:
     return cells
 
 
-def real_cells(name: str, found: Outcomes, *, fitted: bool = False) -> str:
+def real_cells(name: str, found: Outcomes) -> str:
     """One matcher on the real set."""
     out = found[name]
-    kept = out.kept_fitted if fitted else out.kept
-    return f"{kept.depths / out.pairs:9,.0f}{times(kept.depths, found[FIRST].kept.depths):>7}"
+    return f"{out.kept.depths / out.pairs:9,.0f}{times(out.kept.depths, found[FIRST].kept.depths):>7}"
 
 
 def main(example: Path) -> None:

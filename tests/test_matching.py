@@ -19,13 +19,14 @@ from pipeline.geometry.poses import RelativePose, relative_pose
 from pipeline.geometry.rotations import enu_from_cam
 from pipeline.matching.features import Features, extract
 from pipeline.matching.matcher import SearchLimits, View
+from pipeline.matching.nearest import NearestMatcher
 from pipeline.matching.pair import PairMatches, match_pair
 from pipeline.matching.reach import rays_in_ref
-from pipeline.matching.sift import SiftExtractor, SiftMatcher, root_sift
+from pipeline.matching.sift import SiftExtractor, root_sift
 from pipeline.matching.verify import consensus, epipolar_residuals, without_duplicates
 
 LIMITS = SearchLimits(BAND, 1.5, 10**6)
-MATCHER = SiftMatcher(SiftExtractor(10**6), 0.85)
+MATCHER = NearestMatcher(SiftExtractor(10**6), root_sift, 0.85)
 
 
 def matched(ref: View, src: View, of: RelativePose) -> PairMatches:
@@ -157,7 +158,7 @@ def test_a_black_image_matches_nothing() -> None:
 def test_the_fit_of_the_patches_brings_a_match_nearer_and_knows_how_near() -> None:
     """Matched at half the size and fitted on the whole image, under poses with an error."""
     rng = np.random.default_rng(20)
-    matcher = SiftMatcher(SiftExtractor(400, 1500), 0.85)
+    matcher = NearestMatcher(SiftExtractor(400, 1500), root_sift, 0.85)
     of = plane_photos(rng)
     features = extract(matcher.extractor, of.images)
     ref, src = (View(*parts) for parts in zip(of.cameras, of.images, features, strict=True))

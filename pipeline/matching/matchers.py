@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pipeline.matching.flow.estimators import DisFlow
 from pipeline.matching.flow.matcher import DenseMatcher
 from pipeline.matching.matcher import Matcher
-from pipeline.matching.sift import SiftExtractor, SiftMatcher
+from pipeline.matching.nearest import NearestMatcher
+from pipeline.matching.sift import SiftExtractor, root_sift
 from pipeline.matching.weights.files import FoundWeights, find_weights
 from pipeline.matching.weights.known import NETWORKS_OF
 
@@ -55,7 +56,7 @@ class MatcherSetting:
         most = self.max_features or _MAX_FEATURES[self.name]
         ratio = self.ratio or _RATIO.get(self.name, 1.0)
         if self.name == "sift":
-            return SiftMatcher(SiftExtractor(self.max_image_px, most), ratio)
+            return NearestMatcher(SiftExtractor(self.max_image_px, most), root_sift, ratio)
         if self.name == "dis":
             return DenseMatcher(DisFlow(), most)
         # Whoever matches without a network should not wait for torch.

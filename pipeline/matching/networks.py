@@ -10,10 +10,11 @@ from pipeline.matching.flow.matcher import DenseMatcher
 from pipeline.matching.flow.raft import raft_from_state
 from pipeline.matching.flow.raft_flow import RaftFlow
 from pipeline.matching.matcher import Matcher
+from pipeline.matching.nearest import NearestMatcher
 from pipeline.matching.weights.files import load_state
 from pipeline.matching.xfeat.lighterglue import LighterGlueMatcher, LighterGlueNetwork
 from pipeline.matching.xfeat.network import XFeatNetwork
-from pipeline.matching.xfeat.sparse import XFeatExtractor, XFeatMatcher
+from pipeline.matching.xfeat.sparse import XFeatExtractor, unit
 from pipeline.matching.xfeat.star import StarExtractor, StarMatcher
 
 # Pieces of an image that a GPU looks at together.
@@ -44,4 +45,4 @@ def build(setting: MatcherSetting, max_features: int, ratio: float, notes: list[
     extractor = XFeatExtractor(xfeat, setting.max_image_px, max_features)
     if setting.name == "xfeat-lighterglue":
         return LighterGlueMatcher(extractor, LighterGlueNetwork(setting.weights[1], device, notes))
-    return XFeatMatcher(extractor, ratio)
+    return NearestMatcher(extractor, unit, ratio)

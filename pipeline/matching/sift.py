@@ -1,4 +1,4 @@
-"""SIFT: features by OpenCV, mutual nearest neighbours of RootSIFT in the band."""
+"""SIFT by OpenCV, compared as RootSIFT."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import AnyArray, Bytes, Singles
-from pipeline.geometry.poses import RelativePose
 from pipeline.matching.features import Features
-from pipeline.matching.guided import match_guided
-from pipeline.matching.matcher import Candidates, SearchLimits, View
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,28 +47,6 @@ class SiftExtractor:
         pixels = np.array([point.pt for point in keypoints], np.float64)
         strength = np.array([point.response for point in keypoints], np.float32)
         return Features(pixels, descriptors.astype(np.uint8), strength, np.ones(len(pixels), np.float32))
-
-
-@dataclass(frozen=True, slots=True)
-class SiftMatcher:
-    """Mutual nearest neighbours that pass the ratio test in the band.
-
-    Args:
-        extractor: Finds the features.
-        ratio: Largest ratio of best to second-best distance.
-    """
-
-    extractor: SiftExtractor
-    ratio: float
-    colour: bool = False
-
-    def candidates(self, ref: View, src: View, pose: RelativePose, limits: SearchLimits) -> Candidates:
-        """As `Matcher.candidates`; the score is 1 - ratio."""
-        reach = limits.reach(ref.features.pixels, ref.camera, src.features.pixels, src.camera, pose)
-        found = match_guided(
-            root_sift(ref.features.descriptors), root_sift(src.features.descriptors), reach, ratio=self.ratio
-        )
-        return Candidates.of_features(ref, src, (found.ref, found.src), found.score, limits)
 
 
 def root_sift(descriptors: AnyArray) -> Singles:

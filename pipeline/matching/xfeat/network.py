@@ -5,7 +5,7 @@ Potje, Cadar, Araujo, Martins and Nascimento, "XFeat: Accelerated Features for L
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +18,8 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from pipeline.geometry.arrays import Bytes
+from pipeline.matching.devices import in_batches
+from pipeline.matching.features import Features
 from pipeline.matching.weights.files import FoundWeights, load_state, strict_load
 
 # The network halves its image five times.
@@ -58,6 +60,17 @@ class XFeatNetwork:
     def batch(self) -> int:
         """Images that are best looked at together: a processor gains nothing by it."""
         return 1 if self.device.type == "cpu" else 8
+
+    def each(
+        self, run: Callable[[Sequence[Bytes], torch.device], list[Features]], pieces: Sequence[Bytes]
+    ) -> list[Features]:
+        """The features of images of one size, in batches that the device's memory bears.
+
+        Args:
+            run: From a batch, on a device.
+            pieces: (height, width) each.
+        """
+        return in_batches(run, pieces, self.device, self.batch, self.notes)
 
 
 def _folded(model: XFeat) -> XFeat:

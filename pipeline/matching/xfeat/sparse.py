@@ -1,4 +1,4 @@
-"""XFeat by kornia: sparse keypoints of 64 numbers each, and mutual nearest neighbours of them in the band.
+"""XFeat by kornia: sparse keypoints of 64 numbers each.
 
 Potje, Cadar, Araujo, Martins and Nascimento, "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024.
 Its keypoints are whole pixels of the image it looks at; `subpixel` makes them better.
@@ -12,12 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipeline.geometry.arrays import Bytes, Floats, Singles
-from pipeline.geometry.poses import RelativePose
-from pipeline.matching.devices import in_batches
+from pipeline.geometry.arrays import AnyArray, Bytes, Singles
 from pipeline.matching.features import Features
-from pipeline.matching.guided import match_guided
-from pipeline.matching.matcher import Candidates, SearchLimits, View
 from pipeline.matching.xfeat.network import XFeatNetwork, padded
 
 
@@ -49,8 +45,7 @@ class XFeatExtractor:
 
     def detect(self, pieces: Sequence[Bytes]) -> list[Features]:
         """As `Extractor.detect`."""
-        network = self.network
-        return in_batches(self._run, pieces, network.device, network.batch, network.notes)
+        return self.network.each(self._run, pieces)
 
     def _run(self, pieces: Sequence[Bytes], device: torch.device) -> list[Features]:
         found = self.network.model.to(device).detectAndCompute(
@@ -68,28 +63,8 @@ def _features(found: dict[str, torch.Tensor], shape: tuple[int, ...]) -> Feature
     ).take(inside)
 
 
-@dataclass(frozen=True, slots=True)
-class XFeatMatcher:
-    """Mutual nearest neighbours that pass the ratio test in the band.
-
-    Args:
-        extractor: Finds the features.
-        ratio: Largest ratio of best to second-best distance.
-    """
-
-    extractor: XFeatExtractor
-    ratio: float
-    colour: bool = False
-
-    def candidates(self, ref: View, src: View, pose: RelativePose, limits: SearchLimits) -> Candidates:
-        """As `Matcher.candidates`; the score is 1 - ratio."""
-        reach = limits.reach(ref.features.pixels, ref.camera, src.features.pixels, src.camera, pose)
-        found = match_guided(ref.features.descriptors, src.features.descriptors, reach, ratio=self.ratio)
-        return Candidates.of_features(ref, src, (found.ref, found.src), found.score, limits)
-
-
-def unit(descriptors: Floats | Singles) -> Singles:
-    """(n, d) descriptors scaled to unit length."""
+def unit(descriptors: AnyArray) -> Singles:
+    """(n, d) descriptors scaled to unit length, float32."""
     length = np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
     out: Singles = (descriptors / length).astype(np.float32)
     return out

@@ -15,7 +15,6 @@ import torch
 
 from pipeline.geometry.arrays import Bytes, Floats, Singles
 from pipeline.geometry.poses import RelativePose
-from pipeline.matching.devices import in_batches
 from pipeline.matching.features import Features
 from pipeline.matching.guided import match_guided
 from pipeline.matching.matcher import Candidates, SearchLimits, View
@@ -58,8 +57,7 @@ class StarExtractor:
 
     def detect(self, pieces: Sequence[Bytes]) -> list[Features]:
         """As `Extractor.detect`."""
-        network = self.network
-        return in_batches(self._run, pieces, network.device, network.batch, network.notes)
+        return self.network.each(self._run, pieces)
 
     def _run(self, pieces: Sequence[Bytes], device: torch.device) -> list[Features]:
         height, width = pieces[0].shape

@@ -79,7 +79,7 @@ def test_shrinking_keeps_the_image_s_edges(width: int, height: int, longest: int
 
 @settings(max_examples=60)
 @given(
-    width=st.integers(1, 120), height=st.integers(1, 120), longest=st.integers(1, 70), margin=st.integers(0, 30)
+    width=st.integers(1, 40), height=st.integers(1, 40), longest=st.integers(1, 24), margin=st.integers(0, 12)
 )  # fmt: skip
 def test_every_pixel_is_owned_by_one_piece(width: int, height: int, longest: int, margin: int) -> None:
     v, u = np.mgrid[:height, :width].reshape(2, -1)

@@ -201,7 +201,8 @@ def test_dis_on_a_plane_through_two_lenses(ground: Plane, longest_px: int, media
 @pytest.mark.real
 @pytest.mark.slow
 def test_raft_on_a_plane_through_two_lenses(raft: RaftFlow) -> None:
-    check_plane(plane(colour=True), raft, 1600, 0.3)
+    # At half the size and with fewer steps, a processor's time being what it is.
+    check_plane(plane(colour=True), replace(raft, iterations=8), 400, 0.45)
 
 
 @pytest.mark.parametrize("wrong_deg", [(2.0, -2.0, 3.0), (-3.0, 3.0, 0.0)])
@@ -516,7 +517,7 @@ def off_epipolar_line(found: DenseMatches, ref: Camera, src: Camera, pose: Relat
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["dis", "raft"])
 def test_a_building_under_its_laser_poses(shared: Path, raft: RaftFlow, name: str) -> None:
-    estimator, longest_px = (DisFlow(), 1600) if name == "dis" else (raft, 768)
+    estimator, longest_px = (DisFlow(), 1600) if name == "dis" else (replace(raft, iterations=8), 384)
     (ref, ref_turn, ref_centre), (src, src_turn, src_centre) = (fountain(shared, number) for number in (4, 5))
     pose = RelativePose(src_turn.T @ ref_turn, src_turn.T @ (ref_centre - src_centre), np.zeros((6, 6)))
     ref_px = grid_points(ref.image, 4000, longest_px)
@@ -525,8 +526,8 @@ def test_a_building_under_its_laser_poses(shared: Path, raft: RaftFlow, name: st
     assert good.mean() > 0.6
     shrunk = 3072 / longest_px
     off = off_epipolar_line(found, ref.camera, src.camera, pose)[good] / shrunk
-    assert 0.02 < np.median(off) < (0.12 if name == "dis" else 0.25)
-    assert np.quantile(off, 0.9) < (0.5 if name == "dis" else 0.8)
+    assert 0.02 < np.median(off) < (0.12 if name == "dis" else 0.2)
+    assert np.quantile(off, 0.9) < (0.5 if name == "dis" else 0.7)
 
 
 @pytest.mark.real
@@ -545,8 +546,9 @@ def test_depths_of_a_room_against_its_measured_ones(shared: Path, raft: RaftFlow
     )
     src_from_ref = np.linalg.inv(poses[int(src_row["pose_row"])]) @ poses[int(ref_row["pose_row"])]
     pose = RelativePose(src_from_ref[:3, :3], src_from_ref[:3, 3], np.zeros((6, 6)))
-    estimator = DisFlow() if name == "dis" else raft
-    found = dense_field(ref, src, pose, estimator, FlowSetting(540, 0.5)).sample(grid_points(ref.image, 2000, 540))
+    estimator, longest_px = (DisFlow(), 540) if name == "dis" else (replace(raft, iterations=8), 400)
+    ref_px = grid_points(ref.image, 2000, longest_px)
+    found = dense_field(ref, src, pose, estimator, FlowSetting(longest_px, 0.5)).sample(ref_px)
     good = consistent(found)
     rays, src_rays = (view.camera.rays(px[good])[:, :2].T for view, px in ((ref, found.ref_px), (src, found.src_px)))
     depth_m = transfer(rays, src_rays, pose, VirtualView.ADAPTIVE)

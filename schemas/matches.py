@@ -18,8 +18,8 @@ MATCHES = TableSchema(
         single("cov_vv", "px^2", "Variance of src_v.", frame="image"),
         flag(
             "inlier",
-            "Its patches fit, and it agrees with the logged pose within its covariance and with the epipolar geometry of "
-            "the matches.",
+            "Its patches fit, and it agrees with the logged pose within its covariance and with the other matches' "
+            "epipolar geometry.",
         ),
     ),
 )

@@ -46,7 +46,7 @@ class Config(StageConfig):
     )
     subpixel: bool = Field(
         True,
-        description="Whether matches are fitted on the full image, each with its own covariance; what does not fit is none",
+        description="Whether matches are fitted on the full image, each with its own covariance, or refused",
     )
     weights: str | tuple[str, ...] | None = Field(
         None,

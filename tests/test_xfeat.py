@@ -329,6 +329,26 @@ def test_a_closed_pair_is_not_assigned_and_a_point_without_an_open_one_is_none(
     assert [len(part) for part in network.match(ref, src, closed)] == [0, 0, 0]
 
 
+def test_what_is_closed_takes_no_share_of_the_probability(
+    glued: tuple[LighterGlueNetwork, Points, Points],
+) -> None:
+    """Twins of src points halve their chance while they are open."""
+    network, ref, src = glued
+    rows, columns, _ = network.match(ref, src, everything(ref, src))
+    n = len(src.features.pixels)
+    doubled = replace(src, features=src.features.take(np.concatenate([np.arange(n), columns])))
+    reach = everything(ref, doubled)
+    # Of equal chances either twin may be the first.
+    shared_chance = dict(zip(*network.match(ref, doubled, reach)[::2], strict=True))
+    reach.open[:, n:] = False
+    found = by_pair(network.match(ref, doubled, reach))
+    both = [pair for pair in zip(rows, columns, strict=True) if pair in found and pair[0] in shared_chance]
+    assert len(both) > 100
+    assert all(column < n for _, column in found)
+    gain = [found[pair] / shared_chance[pair[0]] for pair in both]
+    assert np.median(gain) == pytest.approx(2.0, abs=0.05)
+
+
 @pytest.mark.parametrize("n_ref", [0, 1, 2])
 @pytest.mark.parametrize("n_src", [0, 1, 2])
 def test_few_points_are_no_trouble(glued: tuple[LighterGlueNetwork, Points, Points], n_ref: int, n_src: int) -> None:
@@ -343,6 +363,9 @@ def test_few_points_are_no_trouble(glued: tuple[LighterGlueNetwork, Points, Poin
     assert found[0].dtype == found[1].dtype == np.int64
     assert len(found[0]) == len(found[1]) == len(found[2]) <= min(n_ref, n_src)
     assert np.array_equal(found[0], found[1]), "the true partners, if any"
+    # With all closed, shares of nothing are none: of one pair the chance would be whole.
+    closed = Reachable(np.zeros((n_ref, n_src), np.bool_))
+    assert len(network.match(few_ref, few_src, closed)[0]) == 0
     nothing = replace(ref, features=Features.none())
     assert len(network.match(nothing, src, everything(nothing, src))[0]) == 0
 

@@ -204,7 +204,7 @@ def test_batches_shrink_until_they_fit_and_nothing_is_lost(n: int, room: int, ba
     network = FakeNetwork(room)
     notes: list[str] = []
     assert in_batches(network, range(n), torch.device("cuda"), batch, notes) == [f"cuda {2 * i}" for i in range(n)]
-    assert notes == []
+    assert not any("CPU" in note for note in notes)
     # It does not try the large batch over and over again.
     assert sum(size > room for _, size in network.calls) <= 6
     assert max([size for _, size in network.calls], default=0) <= batch
@@ -215,9 +215,9 @@ def test_what_does_not_fit_alone_goes_to_the_cpu_and_the_user_is_told() -> None:
     notes: list[str] = []
     found = in_batches(network, list(range(14)), torch.device("cuda"), 4, notes)
     assert found == [f"{'cuda' if i <= 9 else 'cpu'} {2 * i}" for i in range(14)]
-    assert len(notes) == 1
-    assert "cuda ran out of memory" in notes[0]
-    assert "4 of 14" in notes[0]
+    assert sum("CPU" in note for note in notes) == 1
+    assert "cuda ran out of memory" in notes[-1]
+    assert "4 of 14" in notes[-1]
     assert network.calls[-1] == ("cpu", 4)
 
 

@@ -491,7 +491,7 @@ def test_batches_that_do_not_fit_are_halved_and_give_the_same(
     assert all(map(same, extractor.detect(pieces), expected))
     assert sizes[0] == 3
     assert 1 in sizes
-    assert extractor.network.notes == []
+    assert not any("CPU" in note for note in extractor.network.notes)
 
 
 @pytest.mark.parametrize("name", ["xfeat", "xfeat-star", "xfeat-lighterglue"])
@@ -517,9 +517,8 @@ def test_a_gpu_without_room_leaves_it_to_the_cpu_and_the_user_is_told(
         monkeypatch.setattr(network.model, "to", partial(to, network.model))
     assert matcher.extractor.batch == 8
     assert all(map(same, matcher.extractor.detect(pieces), expected))
-    assert len(notes) >= 1
-    assert "cuda ran out of memory: 3 of 3" in notes[0]
-    assert "CPU" in notes[0]
+    assert "cuda ran out of memory: 3 of 3" in notes[-1]
+    assert "CPU" in notes[-1]
     for found, right in zip(candidates(matcher, views), pairs, strict=True):
         assert np.array_equal(found, right)
-    assert len(notes) == len(networks)
+    assert sum("CPU" in note for note in notes) >= len(networks)

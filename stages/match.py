@@ -19,13 +19,14 @@ from pipeline.flight import PairRow, camera_by_frame, cameras_of, image_location
 from pipeline.geometry.poses import relative_pose
 from pipeline.matching.features import store_features
 from pipeline.matching.matcher import SearchLimits
-from pipeline.matching.matchers import DENSE, MatcherSetting, device_of, weights_of
-from pipeline.matching.pair import PairMatches, match_pair
+from pipeline.matching.matchers import DENSE, SLOW, MatcherSetting, device_of, weights_of
+from pipeline.matching.pair import match_pair
 from pipeline.matching.reach import Band
+from pipeline.matching.table import matches_table
 from pipeline.matching.views import Source, views
-from schemas import MATCHES
 
-FEATURE_SHARD, PAIR_SHARD = 8, 20
+# A pair of the slow matchers takes seconds, and a shard should not take minutes.
+FEATURE_SHARD, PAIR_SHARD, SLOW_SHARD = 8, 20, 4
 
 
 class Config(StageConfig):
@@ -84,11 +85,11 @@ def run(config: Config, context: Context) -> str:
         wanted = sorted({name for pair in pairs for name in (pair.ref, pair.src)})
         for _ in context.map(partial(_extract, setting), wanted, shard=FEATURE_SHARD, label="images", here=here):
             pass
-    context.map_tables("matches", partial(_match, setting), pairs, shard=PAIR_SHARD, label="pairs", here=here)
+    shard = SLOW_SHARD if setting.matcher.name in SLOW else PAIR_SHARD
+    context.map_tables("matches", partial(_match, setting), pairs, shard=shard, label="pairs", here=here)
     for note in dict.fromkeys(setting.notes):
         context.warn(note)
-    found = inliers = 0
-    empty = 0
+    found = inliers = empty = 0
     per_pair = _count(context.output("matches"))
     for pair in pairs:
         n, n_inliers = per_pair.get(pair.pair_id, (0, 0))
@@ -100,11 +101,11 @@ def run(config: Config, context: Context) -> str:
             "no pair has a match that agrees with its pose",
             found=f"{len(pairs)} pairs, {found} matches",
             expected="matches within the epipolar band of the logged poses",
-            hint="wrong gimbal angles or camera? compare `epitransfer inspect`; widen: --set match.band_sigmas=10",
+            hint="wrong gimbal angles or camera? compare `epitransfer inspect`; widen: --set match.band_sigmas=10; "
+            "few matches a pair: another match.matcher, a larger match.max_features",
         )
-    return f"{inliers} inliers of {found} matches in {counted(len(pairs), 'pair')}" + (
-        f", {empty} without any" if empty else ""
-    )
+    without = f", {empty} without any" if empty else ""
+    return f"{inliers} inliers of {found} matches in {counted(len(pairs), 'pair')}{without}"
 
 
 def _setting(config: Config, context: Context) -> _Setting:
@@ -153,23 +154,8 @@ def _match(setting: _Setting, pairs: Sequence[PairRow]) -> pa.Table:
         found = match_pair(
             matcher, ref_view, src_view, pose, setting.limits, up_in_ref=ref.pose.rotation[2], subpixel=setting.subpixel
         )
-        tables.append(_table(pair.pair_id, found))
+        tables.append(matches_table(pair.pair_id, found))
     return pa.concat_tables(tables).combine_chunks()
-
-
-def _table(pair_id: str, found: PairMatches) -> pa.Table:
-    return MATCHES.from_columns(
-        {
-            "pair_id": [pair_id] * len(found.score),
-            "ref_u": found.ref_px[:, 0],
-            "ref_v": found.ref_px[:, 1],
-            "src_u": found.src_px[:, 0],
-            "src_v": found.src_px[:, 1],
-            "score": found.score.astype("float32"),
-            **{name: found.covariance[:, i].astype("float32") for i, name in enumerate(("cov_uu", "cov_uv", "cov_vv"))},
-            "inlier": found.inlier,
-        }
-    )
 
 
 def _count(folder: Path) -> dict[str, tuple[int, int]]:

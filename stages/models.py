@@ -23,7 +23,7 @@ from pipeline.matching.weights.files import (
     no_such_file,
     weight_places,
 )
-from pipeline.matching.weights.known import KNOWN, KnownWeights, matchers_of
+from pipeline.matching.weights.known import KNOWN, NETWORKS_OF, KnownWeights, matchers_of
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
 
@@ -83,7 +83,10 @@ def _tell(known: KnownWeights, path: Path | None) -> None:
 @app.command()
 def fetch(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="NETWORK|FILE", help="A network's preferred file, or a file.")
+        list[str] | None,
+        typer.Argument(
+            metavar="MATCHER|NETWORK|FILE", help="All a matcher needs, a network's preferred file, or a file."
+        ),
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Every file that has an address.")] = False,
     to: Annotated[
@@ -95,12 +98,19 @@ def fetch(
 
     if bool(names) == everything:
         raise UsageError("E-WEIGHTS-10", "name networks or files, or --all", expected=_choices())
-    wanted = [known for known in KNOWN if known.url] if everything else [_wanted(name) for name in names or ()]
+    networks = [network for name in names or () for network in _networks_of(name)]
+    wanted = [known for known in KNOWN if known.url] if everything else [_wanted(name) for name in networks]
     folder = to or cache_folder()
     for fetched in fetch_files(wanted, folder, Reporter(sys.stderr)):
         typer.echo(f"{fetched.path}: {'fetched, ' if fetched.fresh else 'already there, '}sha256 verified")
     if folder.resolve() not in {place.path.resolve() for place in weight_places()}:
         sys.stderr.write(f"not a place that is looked in by itself: state --set {CONFIGURED}={folder}\n")
+
+
+def _networks_of(name: str) -> list[str]:
+    """What a matcher needs, of alternatives the preferred; any other name stands for itself."""
+    known = name in {entry.network for entry in KNOWN}
+    return [name] if known or name not in NETWORKS_OF else [alternatives[0] for alternatives in NETWORKS_OF[name]]
 
 
 def _wanted(name: str) -> KnownWeights:
@@ -126,7 +136,7 @@ def _choices() -> str:
 @app.command()
 def verify(
     files: Annotated[
-        list[str] | None, typer.Argument(metavar="FILE[#sha256=HEX]", help="All that are found, by default.")
+        list[str] | None, typer.Argument(metavar="FILE[#sha256=HEX]|FOLDER", help="All that are found, by default.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -147,10 +157,13 @@ def verify(
 def _named(files: Sequence[str]) -> list[FoundWeights]:
     # Named files are read as the configuration's are.
     named = [place for place in weight_places(files) if place.origin == CONFIGURED]
+    out = []
     for place in named:
-        if not place.path.is_file():
+        if not place.path.exists():
             raise no_such_file(place.path)
-    return [identified(place.path, place.sha256) for place in named]
+        inside = [place.path / known.file for known in KNOWN] if place.path.is_dir() else [place.path]
+        out += [identified(path, place.sha256) for path in inside if path.is_file()]
+    return out
 
 
 def _error(found: FoundWeights) -> InputError | None:

@@ -3,6 +3,11 @@
 import os
 from pathlib import Path
 
+from pipeline.engine.threads import limit_threads
+
+# Before numpy and torch are imported: processes of tests that each take all cores wait for one another.
+limit_threads()
+
 import pytest
 from flights import epitransfer, write_small_flight
 from hypothesis import settings

@@ -249,6 +249,12 @@ def test_duplicates_leave_the_better_match() -> None:
     src = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [3.1, 2.9], [9.0, 9.0]])
     keep = without_duplicates(ref, src, np.array([0.2, 0.5, 0.3, 0.4, 0.1]))
     assert keep.tolist() == [False, True, False, True, True]
+    # Whoever lost its ref pixel is no rival in src: a chain loses its middle alone.
+    chain = np.array([[0.0, 0.0], [0.0, 0.0], [9.0, 9.0]]), np.array([[0.0, 0.0], [5.0, 5.0], [5.0, 5.0]])
+    assert without_duplicates(*chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
+    near = np.array([[0.0, 0.0], [1.4, 0.0]])
+    assert without_duplicates(near, near, np.array([0.5, 0.6])).tolist() == [True, True]
+    assert without_duplicates(near, near, np.array([0.5, 0.6]), (3.0, 3.0)).tolist() == [False, True]
     assert without_duplicates(ref[:0], src[:0], np.empty(0)).tolist() == []
 
 

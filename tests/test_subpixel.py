@@ -21,6 +21,7 @@ from pipeline.matching.images import read_grey
 from pipeline.matching.patches.patch import Level, Window
 from pipeline.matching.patches.subpixel import PatchSetting, Refined, refine
 from pipeline.matching.patches.warps import predicted_affines
+from pipeline.matching.tiles import Tile
 
 WIDTH, HEIGHT = 320, 240
 PLAIN = PatchSetting(WIDTH)
@@ -146,6 +147,31 @@ def test_only_the_coarse_level_is_used_when_told() -> None:
     assert 0.5 < normalised(fine, at).mean() < 3.0
 
 
+def test_pieces_of_a_large_image_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    texture, at = Texture.seeded(14), points(margin=20)
+    moved = texture.image(lambda px: px + np.array([0.7, -0.4]), noise=2.0, seed=5)
+    images = as_bytes(texture.image(noise=2.0)), as_bytes(moved)
+    whole = refine(*images, at, at, [same(len(at))], replace(PLAIN, matched_px=160))
+    monkeypatch.setattr("pipeline.matching.patches.subpixel._PIECE_PX", 90)
+    pieces = refine(*images, at, at, [same(len(at))], replace(PLAIN, matched_px=160))
+    assert whole.refined.mean() > 0.9
+    np.testing.assert_array_equal(pieces.refined, whole.refined)
+    # Sums are made in other blocks, and the last digits of single precision with them.
+    np.testing.assert_allclose(pieces.src_px, whole.src_px, atol=1e-4)
+    np.testing.assert_allclose(pieces.covariance, whole.covariance, rtol=1e-2, atol=1e-6)
+
+
+def test_an_image_of_any_shape_and_scale_is_refined() -> None:
+    """OpenCV refuses images of 32767 pixels, and patches of as many."""
+    rng = np.random.default_rng(15)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (120, 33000)).astype(np.float32), (0, 0), 2.0).astype(np.uint8)
+    at = np.column_stack([rng.uniform(60, 32900, 60).round(), rng.uniform(40, 80, 60).round()])
+    found = refine(wide, wide, at, at, [same(60)], PatchSetting(33000))
+    assert found.refined.mean() > 0.9
+    np.testing.assert_allclose(found.src_px, at, atol=0.01)
+    assert (2 * PatchSetting(64).half_at(40_000) + 1) ** 2 < 32_767
+
+
 def test_of_the_candidates_the_one_that_correlates_is_taken() -> None:
     texture, at, middle = Texture.seeded(5), points(margin=70), np.array([WIDTH, HEIGHT]) / 2.0
     warp = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -176,7 +202,7 @@ def test_images_of_different_sizes_are_brought_to_the_size_matched_at() -> None:
 
 
 @pytest.mark.parametrize("noise", [2.0, 5.0, 10.0])
-@pytest.mark.parametrize("setting", [PLAIN, PatchSetting.quick(WIDTH)])
+@pytest.mark.parametrize("setting", [PLAIN, PatchSetting(WIDTH, finest_px=WIDTH, half_px=6, iterations=5)])
 def test_the_covariance_tells_the_errors_that_noise_makes(noise: float, setting: PatchSetting) -> None:
     texture, at = Texture.seeded(7), points(600)
     images = [as_bytes(texture.image(noise=noise, seed=seed)) for seed in (1, 2)]
@@ -331,14 +357,16 @@ def test_levels_go_from_the_size_matched_at_to_the_full_one() -> None:
     assert PatchSetting(1600).sizes(4000, 3000) == [(1600, 1200), (4000, 3000)]
     assert PatchSetting(640).sizes(4000, 3000) == [(640, 480), (1600, 1200), (4000, 3000)]
     assert PatchSetting(640, finest_px=1600).sizes(4000, 3000) == [(640, 480), (1600, 1200)]
-    assert PatchSetting.quick(640).sizes(4000, 3000) == [(640, 480)]
+    assert PatchSetting(640, finest_px=640).sizes(4000, 3000) == [(640, 480)]
     assert [PatchSetting(1600).half_at(px) for px in (800, 1600, 3200, 6400)] == [9, 9, 13, 18]
 
 
 def test_a_levels_pixels_are_those_of_its_image() -> None:
-    level = Level.of(as_bytes(Texture.seeded(1).image()), (160, 80), 0.5)
+    tile = Tile(20, 10, 100, 60, (20, 10, 100, 60))
+    level = Level.of(np.zeros((80, 160), np.uint8), tile, np.array([0.5, 1 / 3]), 0.5)
+    assert level.grey.shape == (50, 80)
     np.testing.assert_allclose(
-        level.pixels(np.array([[0.0, 0.0], [319.0, 239.0]])), [[-0.25, -1 / 3], [159.25, 79.0 + 1 / 3]]
+        level.pixels(np.array([[0.0, 0.0], [319.0, 239.0]])) + level.corner, [[-0.25, -1 / 3], [159.25, 79.0 + 1 / 3]]
     )
     at = points(20)
     np.testing.assert_allclose(level.full_pixels(level.pixels(at)), at)

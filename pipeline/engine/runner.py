@@ -87,7 +87,11 @@ def stage_slice(stage: Stage, folder: RunFolder, configuration: Configuration) -
         sources = stage.sources(config)
         if stage.place:
             parts["place of the sources"] = stage.place[1](config)
-    except (InputError, MissingPartError) as error:
+    except MissingPartError as error:
+        # Weights that are not found here: as far as anyone can tell they are the same.
+        known = (folder.record(stage.name) or {}).get("parts", {})
+        parts["sources"], sources = known.get("sources", error.message), ()
+    except InputError as error:
         # Whether outputs are fresh can be asked without the sources at hand; running the stage tells what is missing.
         parts["sources"], sources = error.message, ()
     if sources:

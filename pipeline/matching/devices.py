@@ -90,6 +90,7 @@ def in_batches(
         _empty_cache(device)
         if len(part) > 1:
             batch = len(part) // 2
+            notes.append(f"{device} ran out of memory: batches of {batch} instead of {len(part)}")
         elif device.type == "cpu":
             raise ResourceError(
                 "E-DEVICE-03",
@@ -99,9 +100,7 @@ def in_batches(
             )
         else:
             rest = len(items) - len(results)
-            notes.append(
-                f"{device} ran out of memory: {rest} of {len(items)} image pieces went to the CPU, which is slower"
-            )
+            notes.append(f"{device} ran out of memory: {rest} of {len(items)} items went to the CPU, which is slower")
             device, batch = torch.device("cpu"), asked
     return results
 

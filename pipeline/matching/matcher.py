@@ -114,8 +114,14 @@ class Candidates:
             score: Of the pairs.
             limits: With the features' sigma.
         """
-        in_ref, in_src = ref.features.pixels[rows[0]], src.features.pixels[rows[1]]
-        return cls(in_ref, in_src, score, np.full(len(score), limits.prior_variance(ref.camera, src.camera)))
+        return cls.alike(ref.features.pixels[rows[0]], src.features.pixels[rows[1]], score, ref, src, limits)
+
+    @classmethod
+    def alike(
+        cls, ref_px: Floats, src_px: Floats, score: Floats, ref: View, src: View, limits: SearchLimits
+    ) -> Candidates:
+        """Positions that are all as good as a feature's."""
+        return cls(ref_px, src_px, score, np.full(len(score), limits.prior_variance(ref.camera, src.camera)))
 
 
 class Matcher(Protocol):

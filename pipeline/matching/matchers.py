@@ -14,6 +14,7 @@ from pipeline.matching.weights.files import FoundWeights, find_weights
 from pipeline.matching.weights.known import NETWORKS_OF
 
 DENSE = ("raft", "dis")
+SLOW = (*DENSE, "xfeat-lighterglue")
 # Most features of an image: what a matcher takes in its stride.
 _MAX_FEATURES: Mapping[str, int] = {
     "sift": 8192,

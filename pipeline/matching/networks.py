@@ -36,7 +36,7 @@ def build(setting: MatcherSetting, max_features: int, ratio: float, notes: list[
     device = torch.device(setting.device)
     if setting.name == "raft":
         (weights,) = setting.weights
-        network = raft_from_state(load_state(weights)).eval()
+        network = raft_from_state(load_state(weights), str(weights.path))
         batch = 1 if device.type == "cpu" else _GPU_BATCH
         return DenseMatcher(RaftFlow(network, weights.sha256, device, batch=batch, notes=notes), max_features)
     xfeat = XFeatNetwork(setting.weights[0], device, notes)

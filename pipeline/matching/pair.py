@@ -60,7 +60,8 @@ def match_pair(
         subpixel: Whether matches are moved to where their patches fit, and refused where these do not.
     """
     made = matcher.candidates(ref, src, pose, limits)
-    keep = without_duplicates(made.ref_px, made.src_px, made.score)
+    cells = limits.shrink(ref.camera), limits.shrink(src.camera)
+    keep = without_duplicates(made.ref_px, made.src_px, made.score, cells)
     ref_px, src_px, variance = made.ref_px[keep], made.src_px[keep], made.variance_px2[keep]
     covariance = np.stack([variance, np.zeros_like(variance), variance], axis=1)
     good = np.ones(len(ref_px), np.bool_)
@@ -68,6 +69,8 @@ def match_pair(
         fitted = _fitted(ref_px, src_px, ref, src, pose, limits, up_in_ref)
         good = fitted.refined
         src_px[good], covariance[good] = fitted.src_px[good], fitted.covariance[good]
+        # Neighbouring cells of a semi-dense matcher may find the same place.
+        good[good] = without_duplicates(ref_px[good], src_px[good], made.score[keep][good])
     good[good] = _agreeing(ref_px[good], src_px[good], covariance[good], ref, src, pose, limits)
     return PairMatches(ref_px, src_px, made.score[keep], covariance, good)
 

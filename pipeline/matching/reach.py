@@ -81,7 +81,9 @@ def epipolar_angles(rays: Floats, pose: RelativePose, band: Band, pixel_rad: flo
         band: Of the search.
         pixel_rad: Angle of a pixel.
     """
-    axis = pose.centre / np.linalg.norm(pose.centre)
+    # Without a baseline there is no band, and no angle is a number.
+    with np.errstate(invalid="ignore"):
+        axis = pose.centre / np.linalg.norm(pose.centre)
     # Any fixed direction across the baseline serves as zero.
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)

@@ -10,7 +10,6 @@ import numpy as np
 from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.poses import RelativePose
 
-_CELL_PX = 1.0
 _SEED_CONFIDENCE = 0.9999
 _ITERATIONS = 10_000
 
@@ -28,26 +27,27 @@ class Residuals:
     sigma_rad: Floats
 
 
-def without_duplicates(ref_px: Floats, src_px: Floats, score: Floats) -> Bools:
+def without_duplicates(
+    ref_px: Floats, src_px: Floats, score: Floats, cell_px: tuple[float, float] = (1.0, 1.0)
+) -> Bools:
     """Keeps the best-scored of matches that share a pixel in either image (features with two orientations).
 
     Args:
         ref_px: (n, 2).
         src_px: (n, 2).
         score: (n,).
+        cell_px: What counts as one pixel of ref and of src.
 
     Returns:
         (n,) True for the matches to keep.
     """
     order = np.argsort(-score, kind="stable")
+    for pixels, cell in zip((ref_px, src_px), cell_px, strict=True):
+        # A match that has lost its ref pixel is no rival for the src pixel any more.
+        _, first = np.unique(np.round(pixels[order] / cell).astype(np.int64), axis=0, return_index=True)
+        order = order[np.sort(first)]
     keep = np.zeros(len(score), np.bool_)
     keep[order] = True
-    for pixels in (ref_px, src_px):
-        cells = np.round(pixels[order] / _CELL_PX).astype(np.int64)
-        _, first = np.unique(cells, axis=0, return_index=True)
-        unique = np.zeros(len(order), np.bool_)
-        unique[first] = True
-        keep[order[~unique]] = False
     return keep
 
 

@@ -25,7 +25,7 @@ def grid_points(image: Bytes, count: int, longest_px: int) -> Floats:
 
     Args:
         image: (h, w) grey or (h, w, 3) red, green, blue.
-        count: About how many cells.
+        count: At most so many cells.
         longest_px: Longest side texture is looked at, as images are matched.
 
     Returns:
@@ -35,8 +35,8 @@ def grid_points(image: Bytes, count: int, longest_px: int) -> Floats:
     size = shrunk_size(width, height, longest_px)
     shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     grey = np.asarray(shrunk if image.ndim == 2 else cv2.cvtColor(shrunk, cv2.COLOR_RGB2GRAY), np.uint8)
-    across = int(np.clip(round(np.sqrt(count * size[0] / size[1])), 1, size[0]))
-    down = int(np.clip(round(count / across), 1, size[1]))
+    across = int(np.clip(np.sqrt(count * size[0] / size[1]), 1, size[0]))
+    down = int(np.clip(count // across, 1, size[1]))
     columns, rows = (np.linspace(0, n, k + 1).round().astype(np.int64) for n, k in ((size[0], across), (size[1], down)))
     # Cells of one width: the narrower ones look at their last column twice.
     offsets = np.arange(int(np.diff(columns).max()))

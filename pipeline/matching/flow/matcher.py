@@ -49,5 +49,6 @@ class DenseMatcher:
         ref_px, src_px, missed = ref_px[near], src_px[near], missed[near]
         prior = limits.prior_variance(ref.camera, src.camera)
         # The way back has an error of its own, so that half of what it misses by is the way there's.
-        variance = prior + 0.5 * (missed * limits.shrink(src.camera)) ** 2
+        seen_in_src = limits.shrink(ref.camera) * src.camera.focal_px / ref.camera.focal_px
+        variance = prior + 0.5 * (missed * seen_in_src) ** 2
         return Candidates(ref_px, src_px, 1.0 / (1.0 + missed), variance)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Ints, Singles
+from pipeline.matching.tiles import Tile
 
 # Sigma of the Gaussian weights over half the patch's side.
 _WEIGHT_SIGMA = 0.6
@@ -63,33 +64,41 @@ def _parts(half: int) -> Singles:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """An image at one size.
+    """A piece of an image at one size.
 
     Args:
         grey: (h, w) blurred.
-        scale: (2,) its size over that of the image as given.
+        scale: (2,) the whole image's size over that as given.
+        corner: (2,) px, column and row of the piece's first pixel.
     """
 
     grey: Singles
     scale: Floats
+    corner: Floats
 
     @classmethod
-    def of(cls, image: Bytes, size: tuple[int, int], blur_px: float) -> Level:
-        """An image brought to a size (width, height) and blurred there."""
-        full = (image.shape[1], image.shape[0])
-        small = image if size == full else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    def of(cls, image: Bytes, tile: Tile, scale: Floats, blur_px: float) -> Level:
+        """A piece of an image, blurred.
+
+        Args:
+            image: (h, w) brought to the level's size.
+            tile: The piece.
+            scale: (2,) its size over that of the image as given.
+            blur_px: Sigma of the blur.
+        """
         kernel = cv2.getGaussianKernel(2 * int(np.ceil(3.0 * blur_px)) + 1, blur_px, cv2.CV_32F)
-        blurred = cv2.sepFilter2D(small, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-        return cls(np.asarray(blurred, np.float32), np.array(size) / np.array(full))
+        piece = tile.cut(image)
+        blurred = cv2.sepFilter2D(piece, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+        return cls(np.asarray(blurred, np.float32), scale, np.array([tile.left, tile.top], np.float64))
 
     def pixels(self, full_px: Floats) -> Floats:
-        """Pixels of this level from those of the image as given."""
-        out: Floats = (full_px + 0.5) * self.scale - 0.5
+        """Pixels of this piece from those of the image as given."""
+        out: Floats = (full_px + 0.5) * self.scale - 0.5 - self.corner
         return out
 
     def full_pixels(self, pixels: Floats) -> Floats:
-        """Pixels of the image as given from those of this level."""
-        out: Floats = (pixels + 0.5) / self.scale - 0.5
+        """Pixels of the image as given from those of this piece."""
+        out: Floats = (pixels + self.corner + 0.5) / self.scale - 0.5
         return out
 
     def holds(self, pixels: Floats, margin: float) -> Bools:

@@ -15,15 +15,17 @@ Lucas-Kanade 20 years on, IJCV 56 (3), 2004, for the inverse composition.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Ints, Singles
 from pipeline.matching.images import shrunk_size
 from pipeline.matching.patches.patch import Level, Patches, Window
 from pipeline.matching.patches.warps import inverse_2x2
+from pipeline.matching.tiles import Tile, tiles
 
 # Matches per block: enough to hide the calls' own cost, few enough for the caches.
 _BLOCK = 256
@@ -37,6 +39,12 @@ _LARGEST_BEND, _LARGEST_BEND_STEP = 0.6, 0.3
 # Parameters of a patch: shift, warp, gain and offset.
 _PARAMETERS = 8
 _LEAST_NOISE_GREY = 1.0
+# OpenCV resamples no more than 32766 pixels of a patch at once.
+_LARGEST_HALF_PX = 90
+# Side of the pieces that large images are refined in.
+_PIECE_PX = 4096
+# Of a patch in src against that in ref, as far as pieces are concerned.
+_LARGEST_STRETCH = 4.0
 # Square of a central difference of slightly blurred white noise over the square of two images' difference.
 _NOISE_GRADIENT = 0.25
 # The covariance is _FORMAL times that of the normal equations, and _SCATTER times that of the patch's parts, and
@@ -79,17 +87,13 @@ class PatchSetting:
     least_correlation: float = 0.7
     largest_sigma_px: float = 0.5
 
-    @classmethod
-    def quick(cls, matched_px: int) -> PatchSetting:
-        """Small patches, at the size matched at only."""
-        return cls(matched_px, finest_px=matched_px, half_px=6, iterations=5)
-
     def half_at(self, longest_px: int) -> int:
         """Half the patch's side in a level whose longest side is this.
 
         A larger patch tells more and costs more, and reaches over more of the scene's depths.
         """
-        return round(self.half_px * math.sqrt(max(1.0, longest_px / self.matched_px)))
+        grown = round(self.half_px * math.sqrt(max(1.0, longest_px / self.matched_px)))
+        return min(grown, _LARGEST_HALF_PX)
 
     def sizes(self, width: int, height: int) -> list[tuple[int, int]]:
         """Widths and heights, coarse to fine, that an image is refined at."""
@@ -150,22 +154,68 @@ def refine(
     sizes = [setting.sizes(image.shape[1], image.shape[0]) for image in images]
     for level in range(max(len(of) for of in sizes)):
         # An image with fewer levels stays at its own finest for the rest.
-        ref, src = (
-            Level.of(image, of[min(level, len(of) - 1)], setting.blur_px)
-            for image, of in zip(images, sizes, strict=True)
-        )
-        window = Window.of(setting.half_at(max(ref.grey.shape)))
+        ref, src = (_Sized.of(image, of[min(level, len(of) - 1)]) for image, of in zip(images, sizes, strict=True))
+        window = Window.of(setting.half_at(max(ref.image.shape)))
         warps = [src.scale[:, None] * affine / ref.scale for affine in affines]
-        for start in range(0, len(ref_px), _BLOCK):
-            part = slice(start, start + _BLOCK)
-            patches = Patches.of(ref, ref.pixels(ref_px[part]), window, setting.misfit_grey / setting.bend_sigma)
-            moved = _moved(patches, src, src.pixels(found.src_px[part]), [warp[part] for warp in warps], setting)
-            rows = start + np.flatnonzero(moved.refined)
-            found.src_px[rows] = src.full_pixels(moved.src_px[moved.refined])
-            found.covariance[rows] = moved.covariance[moved.refined] / (src.scale[[0, 0, 1]] * src.scale[[0, 1, 1]])
-            found.refined[rows] = True
-            found.correlation[rows] = moved.correlation[moved.refined]
+        for rows, in_ref, in_src in _pieces(ref, src, ref_px, found.src_px, window, setting):
+            patches = Patches.of(in_ref, in_ref.pixels(ref_px[rows]), window, setting.misfit_grey / setting.bend_sigma)
+            moved = _moved(patches, in_src, in_src.pixels(found.src_px[rows]), [warp[rows] for warp in warps], setting)
+            good = rows[moved.refined]
+            found.src_px[good] = in_src.full_pixels(moved.src_px[moved.refined])
+            found.covariance[good] = moved.covariance[moved.refined] / (src.scale[[0, 0, 1]] * src.scale[[0, 1, 1]])
+            found.refined[good] = True
+            found.correlation[good] = moved.correlation[moved.refined]
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Sized:
+    """An image brought to the size of a level.
+
+    Args:
+        image: (h, w).
+        scale: (2,) its size over that of the image as given.
+    """
+
+    image: Bytes
+    scale: Floats
+
+    @classmethod
+    def of(cls, image: Bytes, size: tuple[int, int]) -> _Sized:
+        full = (image.shape[1], image.shape[0])
+        small = image if size == full else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return cls(small, np.array(size) / np.array(full))
+
+    def tiles(self, margin: int) -> list[Tile]:
+        return tiles(self.image.shape[1], self.image.shape[0], _PIECE_PX, margin)
+
+    def pixels(self, full_px: Floats) -> Floats:
+        out: Floats = (full_px + 0.5) * self.scale - 0.5
+        return out
+
+
+def _pieces(
+    ref: _Sized, src: _Sized, ref_px: Floats, src_px: Floats, window: Window, setting: PatchSetting
+) -> Iterator[tuple[Ints, Level, Level]]:
+    """Blocks of matches with the pieces of both images that their patches lie in: no image is held blurred as a whole.
+
+    Matches outside their image are in none.
+    """
+    # A patch of src may be stretched, turned and moved.
+    margin = math.ceil(2.0 * window.half * _LARGEST_STRETCH + setting.reach_px + 4.0)
+    in_ref, in_src = ref.pixels(ref_px), src.pixels(src_px)
+    for ref_tile in ref.tiles(margin):
+        near = np.flatnonzero(ref_tile.owns(in_ref))
+        if not near.size:
+            continue
+        of_ref = Level.of(ref.image, ref_tile, ref.scale, setting.blur_px)
+        for src_tile in src.tiles(margin):
+            rows = near[src_tile.owns(in_src[near])]
+            if not rows.size:
+                continue
+            of_src = Level.of(src.image, src_tile, src.scale, setting.blur_px)
+            for start in range(0, len(rows), _BLOCK):
+                yield rows[start : start + _BLOCK], of_ref, of_src
 
 
 def _moved(patches: Patches, src: Level, start: Floats, warps: Sequence[Floats], setting: PatchSetting) -> Refined:

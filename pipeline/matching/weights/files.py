@@ -107,6 +107,14 @@ def _configured_place(text: str) -> WeightPlace:
             found=f"{len(digest)} characters",
             expected="64 hexadecimal digits",
         )
+    if marked and Path(path).expanduser().is_dir():
+        raise InputError(
+            "E-WEIGHTS-05",
+            "a digest is stated of a folder",
+            where=f"{CONFIGURED}={text}",
+            expected="a digest goes with a file",
+            hint="name the file, or leave the digest out: known files in a folder are checked anyway",
+        )
     return WeightPlace(Path(path).expanduser(), CONFIGURED, digest.lower())
 
 
@@ -245,14 +253,16 @@ def check_weights(found: FoundWeights, data: bytes) -> None:
     size = found.known.size_bytes if found.known else None
     truncated = size is not None and len(data) < size
     origin = found.known.network if found.known and found.known.url else ""
-    again = f"fetch it again: epitransfer models fetch {origin}; " if origin else ""
+    again = f"fetch it again: epitransfer models fetch {origin}" if origin else "copy it again"
+    own = f"; if the file is your own: --set {CONFIGURED}={found.path}{_STATED}{digest}"
     raise InputError(
         "E-WEIGHTS-02",
         "the weights are truncated" if truncated else "the weights are not what they should be",
         where=str(found.path),
         found=f"{len(data)} bytes, sha256 {digest}",
         expected=(f"{size} bytes, " if size is not None else "") + f"sha256 {found.sha256}",
-        hint=f"{again}if the file is your own: --set {CONFIGURED}={found.path}{_STATED}{digest}",
+        # A file that is cut short is nobody's own.
+        hint=again if truncated else again + own,
     )
 
 
@@ -309,7 +319,7 @@ def _read_torch(found: FoundWeights, data: bytes) -> Any:
             return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except _DAMAGED as error:
         text = str(error)
-        code = re.search(r"Unsupported (?:global|class|operand)\W+(?:GLOBAL )?([\w.]+)", text)
+        code = re.search(r"(?i)unsupported (?:global|class)\W+(?:GLOBAL )?([\w.]+)", text)
         told = f"a call of {code[1]}" if code else f"{type(error).__name__} {text.splitlines()[0] if text else ''}"
         raise _unreadable(found.path, told, harmful=code is not None) from error
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import kornia
 import numpy as np
 import torch
@@ -43,7 +44,8 @@ class XFeatNetwork:
     @property
     def settings(self) -> str:
         """What its outputs depend on, as text."""
-        return f"{self.weights.sha256} kornia {kornia.__version__} torch {torch.__version__} {self.device.type}"
+        versions = f"opencv {cv2.__version__} kornia {kornia.__version__} torch {torch.__version__}"
+        return f"{self.weights.sha256} {versions} {self.device.type}"
 
     @cached_property
     def model(self) -> XFeat:

@@ -17,6 +17,7 @@ from flight_truth import configured
 from pipeline.engine.tables import read_table
 from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
 from pipeline.geometry.cameras import Camera
+from pipeline.matching.matchers import MAX_FEATURES
 
 MODEL = "FULL_OPENCV"
 SEED = 0
@@ -42,7 +43,7 @@ def extract(run: Path, database: Path, photos: Path, names: list[str], camera: C
     reader.camera_params = ",".join(repr(value) for value in parameters(camera))
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads, options.use_gpu = settings["max_image_px"], threads, False
-    options.sift.max_num_features = settings["max_features"]
+    options.sift.max_num_features = settings["max_features"] or MAX_FEATURES["sift"]
     pycolmap.extract_features(database, photos, names, pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu)
 
 

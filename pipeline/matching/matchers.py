@@ -16,7 +16,7 @@ from pipeline.matching.weights.known import NETWORKS_OF
 DENSE = ("raft", "dis")
 SLOW = (*DENSE, "xfeat-lighterglue")
 # Most features of an image: what a matcher takes in its stride.
-_MAX_FEATURES: Mapping[str, int] = {
+MAX_FEATURES: Mapping[str, int] = {
     "sift": 8192,
     "xfeat": 4096,
     "xfeat-star": 8192,
@@ -54,7 +54,7 @@ class MatcherSetting:
         Args:
             notes: Where it writes what the user should be told of how it ran.
         """
-        most = self.max_features or _MAX_FEATURES[self.name]
+        most = self.max_features or MAX_FEATURES[self.name]
         ratio = self.ratio or _RATIO.get(self.name, 1.0)
         if self.name == "sift":
             return NearestMatcher(SiftExtractor(self.max_image_px, most), root_sift, ratio)

@@ -12,11 +12,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats, Ints, Singles
-from pipeline.matching.images import read_grey, shrunk_size, to_full_pixels
+from pipeline.matching.images import read_grey, resized, shrunk_size, to_full_pixels
 from pipeline.matching.tiles import tiles
 
 Item = TypeVar("Item")
@@ -92,8 +91,7 @@ def extract(extractor: Extractor, images: Sequence[Bytes]) -> list[Features]:
         height, width = image.shape
         size = shrunk_size(width, height, extractor.max_image_px)
         sizes.append((size, (width, height)))
-        resized = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        small = np.asarray(resized, np.uint8)
+        small = resized(image, size)
         for tile in tiles(*size, TILE_PX, TILE_MARGIN_PX):
             piece = tile.cut(small)
             by_size.setdefault(piece.shape, []).append((index, piece, (tile.left, tile.top), tile.owns))

@@ -66,6 +66,18 @@ def shrunk_size(width: int, height: int, longest_px: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
+def resized(image: Bytes, size: tuple[int, int]) -> Bytes:
+    """An image brought to a size, each pixel the mean of those it covers; the image itself where it has that size.
+
+    Args:
+        image: (height, width) or (height, width, 3).
+        size: Width and height.
+    """
+    if size == (image.shape[1], image.shape[0]):
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def to_full_pixels(pixels: Floats, shrunk: tuple[int, int], full: tuple[int, int]) -> Floats:
     """Pixels of a shrunk image in those of the full one (pixel centres, so half a pixel right).
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import Bytes, Floats, Singles
-from pipeline.matching.images import shrunk_size, to_full_pixels
+from pipeline.matching.images import resized, shrunk_size, to_full_pixels
 
 _BLOCK_PX = 5
 # A block of 5x5 px whose grey values bear noise of 2 levels, in both images, is placed along the direction of its
@@ -33,8 +33,8 @@ def grid_points(image: Bytes, count: int, longest_px: int) -> Floats:
     """
     height, width = image.shape[:2]
     size = shrunk_size(width, height, longest_px)
-    shrunk = image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    grey = np.asarray(shrunk if image.ndim == 2 else cv2.cvtColor(shrunk, cv2.COLOR_RGB2GRAY), np.uint8)
+    small = resized(image, size)
+    grey = small if image.ndim == 2 else np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
     across = int(np.clip(np.sqrt(count * size[0] / size[1]), 1, size[0]))
     down = int(np.clip(count // across, 1, size[1]))
     columns, rows = (np.linspace(0, n, k + 1).round().astype(np.int64) for n, k in ((size[0], across), (size[1], down)))

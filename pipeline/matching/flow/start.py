@@ -17,7 +17,7 @@ from pipeline.geometry.arrays import Bools, Bytes, Floats, Singles
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.flow.estimators import DisFlow, FlowEstimator
-from pipeline.matching.images import shrunk_size
+from pipeline.matching.images import resized, shrunk_size
 
 # The sweep over inverse depths: size of the images, px of parallax between two of them, and the window in which images
 # are compared. So small, the search reaches over a step and over a pose wrong by some degrees besides.
@@ -48,8 +48,7 @@ class FlowView:
         size = shrunk_size(camera.width, camera.height, longest_px)
         if size == (camera.width, camera.height):
             return self
-        image = np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return FlowView(image, camera.scaled(*size))
+        return FlowView(resized(self.image, size), camera.scaled(*size))
 
     def with_channels(self, channels: int) -> FlowView:
         """The view in grey (1) or in colour (3)."""

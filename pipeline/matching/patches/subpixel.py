@@ -18,11 +18,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Bytes, Floats, Ints, Singles
-from pipeline.matching.images import shrunk_size
+from pipeline.matching.images import resized, shrunk_size
 from pipeline.matching.patches.patch import Level, Patches, Window
 from pipeline.matching.patches.warps import inverse_2x2
 from pipeline.matching.tiles import Tile, tiles
@@ -183,8 +182,7 @@ class _Sized:
     @classmethod
     def of(cls, image: Bytes, size: tuple[int, int]) -> _Sized:
         full = (image.shape[1], image.shape[0])
-        small = image if size == full else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return cls(small, np.array(size) / np.array(full))
+        return cls(resized(image, size), np.array(size) / np.array(full))
 
     def tiles(self, margin: int) -> list[Tile]:
         return tiles(self.image.shape[1], self.image.shape[0], _PIECE_PX, margin)

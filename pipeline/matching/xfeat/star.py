@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
@@ -18,6 +17,7 @@ from pipeline.geometry.poses import RelativePose
 from pipeline.matching.devices import in_batches
 from pipeline.matching.features import Features
 from pipeline.matching.guided import match_guided
+from pipeline.matching.images import resized
 from pipeline.matching.matcher import Candidates, SearchLimits, View
 from pipeline.matching.xfeat.network import XFeatNetwork, padded
 from pipeline.matching.xfeat.sparse import unit
@@ -65,16 +65,14 @@ class StarExtractor:
         at_scales: list[list[Features]] = []
         for scale, share in _SCALES:
             size = (max(_CELL_PX, round(width * scale)), max(_CELL_PX, round(height * scale)))
-            resized = [np.asarray(cv2.resize(piece, size, interpolation=cv2.INTER_AREA), np.uint8) for piece in pieces]
-            at_scales.append(self._cells(resized, (width, height), round(share * self.max_features), device))
+            scaled = [resized(piece, size) for piece in pieces]
+            at_scales.append(self._cells(scaled, (width, height), round(share * self.max_features), device))
         return [_joined(parts) for parts in zip(*at_scales, strict=True)]
 
-    def _cells(
-        self, resized: Sequence[Bytes], full: tuple[int, int], most: int, device: torch.device
-    ) -> list[Features]:
-        height, width = resized[0].shape
+    def _cells(self, scaled: Sequence[Bytes], full: tuple[int, int], most: int, device: torch.device) -> list[Features]:
+        height, width = scaled[0].shape
         with torch.inference_mode():
-            maps, _, reliability = self.network.model.to(device).net(padded(resized).to(device))
+            maps, _, reliability = self.network.model.to(device).net(padded(scaled).to(device))
         step = full[0] / width
         out = []
         for features, sure in zip(maps, reliability[:, 0], strict=True):

@@ -46,6 +46,12 @@ class Features:
         """Of an image without any."""
         return cls(np.empty((0, 2)), np.empty((0, 0), np.float32), np.empty(0, np.float32), np.empty(0, np.float32))
 
+    @classmethod
+    def joined(cls, parts: Sequence[Features]) -> Features:
+        """Those of several parts of one image, one after the other; at least one part."""
+        names = ("pixels", "descriptors", "strength", "scale")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
     def take(self, rows: Ints) -> Features:
         """Some of them, in the order of `rows`."""
         return Features(self.pixels[rows], self.descriptors[rows], self.strength[rows], self.scale[rows])
@@ -110,12 +116,7 @@ def _strongest(parts: Sequence[Features], most: int) -> Features:
     full = [part for part in parts if len(part.pixels)]
     if not full:
         return Features.none()
-    joined = Features(
-        *(
-            np.concatenate([getattr(part, name) for part in full])
-            for name in ("pixels", "descriptors", "strength", "scale")
-        )
-    )
+    joined = Features.joined(full)
     return joined.take(np.argsort(-joined.strength, kind="stable")[:most])
 
 

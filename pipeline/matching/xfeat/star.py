@@ -67,7 +67,7 @@ class StarExtractor:
             size = (max(_CELL_PX, round(width * scale)), max(_CELL_PX, round(height * scale)))
             scaled = [resized(piece, size) for piece in pieces]
             at_scales.append(self._cells(scaled, (width, height), round(share * self.max_features), device))
-        return [_joined(parts) for parts in zip(*at_scales, strict=True)]
+        return [Features.joined(parts) for parts in zip(*at_scales, strict=True)]
 
     def _cells(self, scaled: Sequence[Bytes], full: tuple[int, int], most: int, device: torch.device) -> list[Features]:
         height, width = scaled[0].shape
@@ -91,15 +91,6 @@ class StarExtractor:
                 )
             )
         return out
-
-
-def _joined(parts: Sequence[Features]) -> Features:
-    return Features(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("pixels", "descriptors", "strength", "scale")
-        )
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ import pyarrow as pa
 
 from pipeline.geometry.arrays import AnyArray, Floats
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import Pose, PoseSigmas, RelativePose
+from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.geometry.poses import PlacedPair, Placement, Pose, PoseSigmas, RelativePose
 from pipeline.geometry.rotations import quaternion_from_rotation, rotation_from_quaternion
 
 _POSITION = ("east_m", "north_m", "up_m")
@@ -49,9 +50,8 @@ def cameras_of(table: pa.Table) -> dict[str, Camera]:
 
 
 def poses_of(table: pa.Table) -> dict[str, Pose]:
-    """The poses of the usable rows of `frames`, or of all rows of `poses`, by frame_id."""
-    if "usable" in table.column_names:
-        table = table.filter(table.column("usable"))
+    """The logged poses of the usable rows of `frames`, by frame_id."""
+    table = table.filter(table.column("usable"))
     ids = table.column("frame_id").to_pylist()
     rotation = rotation_from_quaternion(columns(table, _QUATERNION)) if ids else np.empty((0, 3, 3))
     centre = columns(table, _POSITION)
@@ -68,6 +68,43 @@ def poses_of(table: pa.Table) -> dict[str, Pose]:
         )
         for i, frame_id in enumerate(ids)
     }
+
+
+def placements_of(table: pa.Table) -> dict[str, Placement]:
+    """Where the cameras of all rows of `poses` stand, by frame_id."""
+    return dict(zip(table.column("frame_id").to_pylist(), _placements(table), strict=True))
+
+
+def _placements(table: pa.Table, role: str = "") -> list[Placement]:
+    if not table.num_rows:
+        return []
+    rotation = rotation_from_quaternion(columns(table, tuple(role + name for name in _QUATERNION)))
+    centre = columns(table, tuple(role + name for name in _POSITION))
+    return [Placement(*of_row) for of_row in zip(rotation, centre, strict=True)]
+
+
+def placement_row(placed: Placement, role: str = "") -> dict[str, object]:
+    """The columns that hold a placement, their names prefixed with a role."""
+    values = (*quaternion_from_rotation(placed.rotation), *placed.centre)
+    return {role + name: float(value) for name, value in zip((*_QUATERNION, *_POSITION), values, strict=True)}
+
+
+def placed_pairs_of(table: pa.Table) -> dict[str, PlacedPair]:
+    """How the pairs of the `relative_poses` table are placed, by pair_id."""
+    both = [
+        [default if value is None else np.array(value).reshape(12, 12) for value in table.column(name).to_pylist()]
+        for name, default in (("gain", np.eye(12)), ("noise", np.zeros((12, 12))))
+    ]
+    parts = (_placements(table, "ref_"), _placements(table, "src_"), *both)
+    ids = table.column("pair_id").to_pylist()
+    return dict(zip(ids, (PlacedPair(*of_row) for of_row in zip(*parts, strict=True)), strict=True))
+
+
+def pose_errors_of(table: pa.Table) -> PoseErrors:
+    """The covariances of the `pose_covariances` table."""
+    ones, others = (table.column(name).to_pylist() for name in ("frame_id", "other_frame_id"))
+    blocks = np.array(table.column("cov").to_pylist(), np.float64).reshape(-1, 6, 6)
+    return PoseErrors.of(tuple(dict.fromkeys(ones)), zip(ones, others, blocks, strict=True))
 
 
 def _rest(whole: Floats, own: Floats) -> Floats:

@@ -8,6 +8,7 @@ from schemas.frames import FRAMES
 from schemas.matches import MATCHES
 from schemas.pairs import PAIRS
 from schemas.points import POINTS
+from schemas.pose_covariances import POSE_COVARIANCES
 from schemas.poses import POSES
 from schemas.relative_poses import RELATIVE_POSES
 from schemas.scores import SCORES
@@ -15,7 +16,9 @@ from schemas.tracks import TRACKS
 
 TABLES: dict[str, TableSchema] = {
     schema.name: schema
-    for schema in (CAMERAS, FRAMES, TRACKS, CLOCKS, PAIRS, MATCHES, RELATIVE_POSES, POSES, DEPTHS, POINTS, SCORES)
+    for schema in (
+        CAMERAS, FRAMES, TRACKS, CLOCKS, PAIRS, MATCHES, RELATIVE_POSES, POSES, POSE_COVARIANCES, DEPTHS, POINTS, SCORES,
+    )
 }
 
 __all__ = [
@@ -27,6 +30,7 @@ __all__ = [
     "PAIRS",
     "POINTS",
     "POSES",
+    "POSE_COVARIANCES",
     "RELATIVE_POSES",
     "SCORES",
     "TABLES",

@@ -4,13 +4,15 @@ from schemas._columns import TableSchema, flag, number, single, text
 
 DEPTHS = TableSchema(
     "depths",
-    2,
+    3,
     "Depths of the matches by every method.",
     (
         text("pair_id", "The pair in `pairs`."),
         text("frame_id", "The ref frame, which the depth belongs to."),
         number("u", "px", "Column in the ref image as given.", frame="image"),
         number("v", "px", "Row in the ref image as given.", frame="image"),
+        number("src_u", "px", "Column of the match in the src image as given.", frame="image"),
+        number("src_v", "px", "Row of the match in the src image as given.", frame="image"),
         text(
             "method",
             "epitransfer (the virtual view of the configuration), epitransfer-lateral, epitransfer-vertical, dlt.",

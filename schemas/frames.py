@@ -16,10 +16,9 @@ def position_columns() -> tuple[Column, ...]:
     )
 
 
-def sigma_columns() -> tuple[Column, ...]:
-    """Standard deviations of a pose: the whole, and the part that is new in each frame."""
+def whole_sigma_columns() -> tuple[Column, ...]:
+    """Standard deviations of a pose, shared by `frames` and `poses`."""
     whole = "One sigma of the whole error"
-    own = "One sigma of the part that is independent from frame to frame; the rest is common to the flight"
     return (
         number("sigma_east_m", "m", f"{whole}, east.", frame="ENU", nullable=True),
         number("sigma_north_m", "m", f"{whole}, north.", frame="ENU", nullable=True),
@@ -27,6 +26,13 @@ def sigma_columns() -> tuple[Column, ...]:
         number("sigma_yaw_deg", "deg", f"{whole}, about the down axis.", frame="NED", nullable=True),
         number("sigma_pitch_deg", "deg", f"{whole}, about the camera's right axis.", nullable=True),
         number("sigma_roll_deg", "deg", f"{whole}, about the level forward axis.", nullable=True),
+    )
+
+
+def own_sigma_columns() -> tuple[Column, ...]:
+    """Standard deviations of the part of a logged pose's error that is new in each frame."""
+    own = "One sigma of the part that is independent from frame to frame; the rest is common to the flight"
+    return (
         number("own_sigma_east_m", "m", f"{own}, east.", frame="ENU", nullable=True),
         number("own_sigma_north_m", "m", f"{own}, north.", frame="ENU", nullable=True),
         number("own_sigma_up_m", "m", f"{own}, up.", frame="ENU", nullable=True),
@@ -68,7 +74,8 @@ FRAMES = TableSchema(
             "pitch_deg", "deg", "Optical axis above the horizon; -90 looks straight down.", frame="NED", nullable=True
         ),
         number("roll_deg", "deg", "Rotation about the optical axis, clockwise positive.", frame="NED", nullable=True),
-        *sigma_columns(),
+        *whole_sigma_columns(),
+        *own_sigma_columns(),
         text("pose_source", "Which tags position and attitude came from."),
         flag("usable", "Whether the later stages use this image."),
         text("problem", "Why it is not usable, or what to distrust; empty when nothing was found."),

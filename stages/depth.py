@@ -86,6 +86,7 @@ def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
         _table(
             pair,
             ref_px,
+            src_px,
             method,
             depths_by(method, view, config.virtual_baseline_m, rays, setting.poses[pair_id], limits),
         )
@@ -93,7 +94,7 @@ def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
     ]
 
 
-def _table(pair: PairRow, ref_px: Floats, method: str, found: MethodDepths) -> pa.Table:
+def _table(pair: PairRow, ref_px: Floats, src_px: Floats, method: str, found: MethodDepths) -> pa.Table:
     n = len(ref_px)
     normal = found.depths.normal.astype(np.float32)
     good = np.isfinite(found.depths.depth_m) & np.isfinite(found.depths.variance_m2) & np.isfinite(normal).all(axis=1)
@@ -107,6 +108,8 @@ def _table(pair: PairRow, ref_px: Floats, method: str, found: MethodDepths) -> p
             "frame_id": [pair.ref] * n,
             "u": ref_px[:, 0],
             "v": ref_px[:, 1],
+            "src_u": src_px[:, 0],
+            "src_v": src_px[:, 1],
             "method": [method] * n,
             "depth_m": known(found.depths.depth_m),
             "sigma_depth_m": known(np.sqrt(found.depths.variance_m2)),
@@ -140,7 +143,7 @@ def _summary(folder: Path, config: Config) -> str:
 
 STAGE = Stage(
     "depth",
-    2,
+    3,
     Config,
     ("frames", "cameras", "pairs", "matches", "relative_poses"),
     ("depths",),

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
 from pydantic import Field
 
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
-from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, poses_of, relative_pose_row, selected_pairs
-from pipeline.geometry.arrays import Floats
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import Pose, relative_pose
-from pipeline.matching.verify import epipolar_residuals
-from schemas import MATCHES, POSES, RELATIVE_POSES
+from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
+from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.geometry.poses import Placement
+from pipeline.refinement.logged import Log, as_logged
+from pipeline.refinement.matched import Matched, by_pair
+from pipeline.refinement.near import together
+from pipeline.refinement.rows import RefinedFrame, covariances_table, pair_row, poses_table
+from schemas import MATCHES, RELATIVE_POSES
 
 
 class Config(StageConfig):
@@ -27,21 +30,23 @@ class Config(StageConfig):
 
 
 def run(config: Config, context: Context) -> str:
-    """Passes the logged poses on and measures what the matches say of them; writes `relative_poses` and `poses`."""
+    """Refines the logged poses on the matches; writes `relative_poses`, `poses` and `pose_covariances`."""
     frames = context.read("frames")
     cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
-    poses = poses_of(frames)
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
+    log = Log(poses_of(frames), cameras, pairs)
+    parts = parquet_files(context.path("matches"))
     found: dict[str, dict[str, object]] = {}
-    for file in parquet_files(context.path("matches")):
-        for pair_id, matches in by_pair(read_table(file, "matches")).items():
-            found[pair_id] = _row(pairs[pair_id], matches, poses, cameras, config.mode)
+    for some in context.map(partial(_logged, log), parts, shard=1, label="parts"):
+        found.update(some)
     # A pair without a single match has its row too.
     none = MATCHES.empty()
-    rows = [found.get(pair_id) or _row(pair, none, poses, cameras, config.mode) for pair_id, pair in pairs.items()]
+    rows = [found.get(name) or _row(log, Matched.of(pair, none, cameras)) for name, pair in pairs.items()]
     context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
-    usable = frames.filter(frames.column("usable"))
-    context.write("poses", POSES.from_columns({name: usable.column(name) for name in POSES.arrow().names}))
+    near = together(tuple(log.poses), list(pairs.values()))
+    errors = PoseErrors.of_log(log.poses, near)
+    context.write("poses", poses_table(_frames(log, errors)))
+    context.write("pose_covariances", covariances_table(errors, near))
     residuals = {str(row["pair_id"]): row["median_before_px"] for row in rows}
     known = {pair_id: float(str(value)) for pair_id, value in residuals.items() if value is not None}
     if not known:
@@ -54,53 +59,30 @@ def run(config: Config, context: Context) -> str:
     )
 
 
-def by_pair(matches: pa.Table) -> dict[str, pa.Table]:
-    """The rows of each pair, in the table's order."""
-    out: dict[str, pa.Table] = {}
-    if not matches.num_rows:
-        return out
-    ids = matches.column("pair_id").combine_chunks().dictionary_encode()
-    codes = ids.indices.to_numpy()
-    ends = np.flatnonzero(np.diff(codes, append=-1)) + 1
-    for start, end in zip(np.concatenate([[0], ends[:-1]]), ends, strict=True):
-        out[ids.dictionary[int(codes[start])].as_py()] = matches.slice(start, end - start)
+def _logged(log: Log, files: Sequence[Path]) -> dict[str, dict[str, object]]:
+    out = {}
+    for file in files:
+        for pair_id, matches in by_pair(read_table(file, "matches")):
+            out[pair_id] = _row(log, Matched.of(log.pairs[pair_id], matches, log.cameras))
     return out
 
 
-def _row(
-    pair: PairRow,
-    matches: pa.Table,
-    poses: Mapping[str, Pose],
-    cameras: Mapping[str, Camera],
-    mode: str,
-) -> dict[str, object]:
-    pose = relative_pose(poses[pair.ref], poses[pair.src])
-    kept = matches.filter(matches.column("inlier"))
-    residual: Floats = np.empty(0)
-    if kept.num_rows:
-        focal = cameras[pair.ref].focal_px
-        ref = cameras[pair.ref].rays(columns(kept, ("ref_u", "ref_v")))
-        src = cameras[pair.src].rays(columns(kept, ("src_u", "src_v")))
-        noise = cameras[pair.src].plane_covariance(src, columns(kept, ("cov_uu", "cov_uv", "cov_vv")))
-        residual = np.abs(epipolar_residuals(ref, src @ pose.rotation, pose, noise).angle_rad) * focal
-    rms = float(np.sqrt(np.mean(residual**2))) if residual.size else None
+def _row(log: Log, matched: Matched) -> dict[str, object]:
+    return pair_row(matched.pair.pair_id, matched.n_matches, as_logged(log, matched))
+
+
+def _frames(log: Log, errors: PoseErrors) -> dict[str, RefinedFrame]:
     return {
-        **relative_pose_row(pair.pair_id, pose),
-        "n_matches": matches.num_rows,
-        "n_inliers": kept.num_rows,
-        "rms_before_px": rms,
-        "median_before_px": float(np.median(residual)) if residual.size else None,
-        "rms_after_px": rms,
-        "mode": mode,
-        "problem": "" if kept.num_rows else "no match agrees with the logged pose",
+        name: RefinedFrame(Placement(pose.rotation, pose.centre), errors.between(name, name))
+        for name, pose in log.poses.items()
     }
 
 
 STAGE = Stage(
     "refine",
-    2,
+    3,
     Config,
     ("frames", "cameras", "pairs", "matches"),
-    ("relative_poses", "poses"),
+    ("relative_poses", "poses", "pose_covariances"),
     run,
 )

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
-from pipeline.flight import camera_by_frame, cameras_of, poses_of
+from pipeline.flight import camera_by_frame, cameras_of, placements_of
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.lidar.nearby import LocalTiles
@@ -135,7 +135,7 @@ def _views(context: Context, wanted: set[str]) -> list[FrameView]:
     cameras = camera_by_frame(context.read("frames"), cameras_of(context.read("cameras")))
     return [
         FrameView(frame_id, View(cameras[frame_id], pose.centre, pose.rotation))
-        for frame_id, pose in poses_of(context.read("poses")).items()
+        for frame_id, pose in placements_of(context.read("poses")).items()
         if frame_id in wanted
     ]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.engine.errors import InputError, ResourceError
 from pipeline.engine.tables import read_table
-from pipeline.flight import cameras_of, poses_of
+from pipeline.flight import cameras_of, placements_of, poses_of
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import Pose
+from pipeline.geometry.poses import Placement, Pose
 
 SUFFIX = ".colmap"
 """Of a folder to export to."""
@@ -45,7 +45,9 @@ def export_colmap(run: Path, folder: Path) -> int:
     """
     frames = read_table(run / "frames.parquet", "frames")
     refined = run / "poses.parquet"
-    poses = poses_of(read_table(refined, "poses") if refined.exists() else frames)
+    poses: Mapping[str, Placement | Pose] = (
+        placements_of(read_table(refined, "poses")) if refined.exists() else poses_of(frames)
+    )
     cameras = cameras_of(read_table(run / "cameras.parquet", "cameras"))
     usable = frames.filter(frames.column("usable"))
     rows = [row for row in usable.select(["frame_id", "image", "camera_id"]).to_pylist() if row["frame_id"] in poses]
@@ -61,7 +63,7 @@ def export_colmap(run: Path, folder: Path) -> int:
     return len(rows)
 
 
-def _model(rows: list[dict[str, str]], cameras: dict[str, Camera], poses: dict[str, Pose]) -> Any:
+def _model(rows: list[dict[str, str]], cameras: dict[str, Camera], poses: Mapping[str, Placement | Pose]) -> Any:
     """The frames as a pycolmap.Reconstruction."""
     import pycolmap  # noqa: PLC0415 - heavy
 

@@ -1,0 +1,1 @@
+"""Poses refined on the matches: pair by pair, or the flight as a whole, with the log as prior."""

@@ -1,0 +1,114 @@
+"""The inliers of a pair as rays, and what they say of a relative pose: the epipolar residual and its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline.flight import PairRow, columns
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.poses import RelativePose
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """The inliers of a pair.
+
+    Args:
+        pair: The pair.
+        n_matches: Matches made, outliers included.
+        ref_px: (n, 2) pixels of ref as given.
+        src_px: (n, 2) pixels of src as given.
+        ref: (n, 3) rays of ref, z = 1.
+        src: (n, 3) rays of src, z = 1.
+        noise: (3, n) covariance xx, xy, yy on src's image plane.
+        focal_px: Of src: what a radian of its rays is in pixels.
+    """
+
+    pair: PairRow
+    n_matches: int
+    ref_px: Floats
+    src_px: Floats
+    ref: Floats
+    src: Floats
+    noise: Floats
+    focal_px: float
+
+    def __len__(self) -> int:
+        return len(self.ref)
+
+    @classmethod
+    def of(cls, pair: PairRow, matches: pa.Table, cameras: Mapping[str, Camera]) -> Matched:
+        """From rows of `matches`.
+
+        Args:
+            pair: The pair.
+            matches: Its rows.
+            cameras: Camera by frame.
+        """
+        kept = matches.filter(matches.column("inlier"))
+        ref_px, src_px = columns(kept, ("ref_u", "ref_v")), columns(kept, ("src_u", "src_v"))
+        ref, src = cameras[pair.ref].rays(ref_px), cameras[pair.src].rays(src_px)
+        noise = cameras[pair.src].plane_covariance(src, columns(kept, ("cov_uu", "cov_uv", "cov_vv")))
+        return cls(pair, matches.num_rows, ref_px, src_px, ref, src, noise, cameras[pair.src].focal_px)
+
+    def residuals_px(self, pose: RelativePose) -> Floats:
+        """(n,) absolute epipolar residuals under a pose, as pixels of src."""
+        return np.abs(epipolar(self, pose.rotation.T, pose.centre).sine) * self.focal_px
+
+
+@dataclass(frozen=True, slots=True)
+class Epipolar:
+    """Residuals of matches under relative poses; all arrays may have leading axes, one per pose.
+
+    Args:
+        sine: (..., n) of the angle between each src ray and the plane of its ref ray and the baseline, signed.
+        sigma: (..., n) its sigma by the noise of the matched position.
+        jacobian: (..., n, 6) of sine, by src's turn and the shift of its centre on ref's axes.
+    """
+
+    sine: Floats
+    sigma: Floats
+    jacobian: Floats
+
+
+def epipolar(matched: Matched, ref_from_src: Floats, centre: Floats) -> Epipolar:
+    """The epipolar residuals of matches.
+
+    With d the ref ray, u the unit src ray on ref's axes and c the src centre, the residual is u . m, m the unit normal
+    (c x d) / |c x d|. A turn a of src gives it a . (u x m), a shift e of its centre e . (d x u - (u . m) d x m) / |c x
+    d|. It does not change with the baseline's length.
+
+    Args:
+        matched: The matches.
+        ref_from_src: (..., 3, 3).
+        centre: (..., 3) m, src's in ref.
+    """
+    unit = matched.src / np.linalg.norm(matched.src, axis=1, keepdims=True)
+    turned = unit @ np.swapaxes(ref_from_src, -1, -2)
+    plane = np.cross(centre[..., None, :], matched.ref)
+    length = np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-12)
+    plane = plane / length
+    sine = np.sum(plane * turned, axis=-1)
+    by_shift = (np.cross(matched.ref, turned) - sine[..., None] * np.cross(matched.ref, plane)) / length
+    in_src = plane @ ref_from_src
+    across = (in_src - sine[..., None] * unit)[..., :2] * unit[:, 2:]
+    xx, xy, yy = matched.noise
+    variance = across[..., 0] * (across[..., 0] * xx + 2.0 * across[..., 1] * xy) + across[..., 1] ** 2 * yy
+    jacobian = np.concatenate([np.cross(turned, plane), by_shift], axis=-1)
+    return Epipolar(sine, np.sqrt(np.maximum(variance, 1e-24)), jacobian)
+
+
+def by_pair(matches: pa.Table) -> Iterator[tuple[str, pa.Table]]:
+    """The rows of each pair, in the table's order."""
+    if not matches.num_rows:
+        return
+    ids = matches.column("pair_id").combine_chunks().dictionary_encode()
+    codes = ids.indices.to_numpy()
+    ends = np.flatnonzero(np.diff(codes, append=-1)) + 1
+    for start, end in zip(np.concatenate([[0], ends[:-1]]), ends, strict=True):
+        yield ids.dictionary[int(codes[start])].as_py(), matches.slice(start, end - start)

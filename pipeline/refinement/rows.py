@@ -1,0 +1,125 @@
+"""What refinement leaves: rows of `relative_poses`, and the tables `poses` and `pose_covariances`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline.flight import placement_row, relative_pose_row
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.geometry.poses import PlacedPair, Placement, relative_jacobian, relative_placement
+from pipeline.geometry.rotations import gimbal_error_axes
+from schemas import POSE_COVARIANCES, POSES
+
+NONE, PAIR, FLIGHT = "none", "pair", "flight"
+_SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
+_GIMBAL_SIGMAS = ("sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg")
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedPair:
+    """A pair's poses after refinement.
+
+    Args:
+        placed: Both cameras, and what their errors are made of.
+        covariance: (12, 12) of the errors of both.
+        mode: NONE, PAIR or FLIGHT.
+        before_px: (n,) absolute epipolar residuals of the inliers under the logged pose.
+        after_px: (n,) the same under this one.
+        moved_sigmas: How far it is from the logged pose; None where it is the logged one.
+        problem: Why the logged pose stands, or what to distrust.
+    """
+
+    placed: PlacedPair
+    covariance: Floats
+    mode: str
+    before_px: Floats
+    after_px: Floats
+    moved_sigmas: float | None = None
+    problem: str = ""
+
+
+def pair_row(pair_id: str, n_matches: int, found: RefinedPair) -> dict[str, object]:
+    """A row of `relative_poses`."""
+    placed = found.placed
+    jacobian = relative_jacobian(placed.ref, placed.src)
+    pose = relative_placement(placed.ref, placed.src, jacobian @ found.covariance @ jacobian.T)
+    alone = found.mode == PAIR
+    return {
+        **relative_pose_row(pair_id, pose),
+        **placement_row(placed.ref, "ref_"),
+        **placement_row(placed.src, "src_"),
+        "gain": placed.gain.ravel().tolist() if alone else None,
+        "noise": placed.noise.ravel().tolist() if alone else None,
+        "n_matches": n_matches,
+        "n_inliers": len(found.before_px),
+        "rms_before_px": _rms(found.before_px),
+        "median_before_px": _median(found.before_px),
+        "rms_after_px": _rms(found.after_px),
+        "median_after_px": _median(found.after_px),
+        "moved_sigmas": found.moved_sigmas,
+        "mode": found.mode,
+        "problem": found.problem,
+    }
+
+
+def _rms(values: Floats) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+def _median(values: Floats) -> float | None:
+    return float(np.median(values)) if values.size else None
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedFrame:
+    """A frame's pose after refinement.
+
+    Args:
+        placed: Where it stands.
+        covariance: (6, 6) of its turn (rad) and shift (m), ENU.
+        refined: Whether matches had a part in it.
+        problem: What to distrust.
+    """
+
+    placed: Placement
+    covariance: Floats
+    refined: bool = field(default=False)
+    problem: str = field(default="")
+
+
+def poses_table(frames: Mapping[str, RefinedFrame]) -> pa.Table:
+    """The table `poses`."""
+    return POSES.from_rows(_frame_row(name, found) for name, found in frames.items())
+
+
+def _frame_row(name: str, found: RefinedFrame) -> dict[str, object]:
+    # A rotation vector is made of turns about the axes of yaw, pitch and roll.
+    by_axes = np.linalg.pinv(gimbal_error_axes(found.placed.rotation))
+    gimbal = np.degrees(np.sqrt(np.diag(by_axes @ found.covariance[:3, :3] @ by_axes.T)))
+    position = np.sqrt(np.diag(found.covariance[3:, 3:]))
+    return {
+        "frame_id": name,
+        **placement_row(found.placed),
+        **{column: float(value) for column, value in zip(_SIGMAS, position, strict=True)},
+        **{column: float(value) for column, value in zip(_GIMBAL_SIGMAS, gimbal, strict=True)},
+        "cov": found.covariance.ravel().tolist(),
+        "refined": found.refined,
+        "problem": found.problem,
+    }
+
+
+def covariances_table(errors: PoseErrors, together: Iterable[tuple[str, str]]) -> pa.Table:
+    """The table `pose_covariances`: every frame with itself, then the couples."""
+    couples = [*((name, name) for name in errors.index), *together]
+    return POSE_COVARIANCES.from_columns(
+        {
+            "frame_id": [one for one, _ in couples],
+            "other_frame_id": [other for _, other in couples],
+            "cov": [errors.between(*couple).ravel().tolist() for couple in couples],
+        }
+    )

@@ -1,4 +1,4 @@
-"""World points from depths, with the covariance that pose, pixels and the flight's common error give them.
+"""World points from depths, with how the errors of both cameras and of the pixels move them.
 
 A point lies at p = s v from the ref centre and q = p - B from the src centre (v the ref ray in ENU at z = 1, B the
 baseline). The depth moves with the src ray's displacement D at the point, ds = a . D, a the depth's normal. With
@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import Pose
+from pipeline.geometry.poses import PlacedPair
 from pipeline.geometry.rotations import skew
 
 
@@ -25,30 +25,17 @@ class WorldPoints:
 
     Args:
         p_in_enu_m: (n, 3).
-        own: (n, 3, 3) m^2, covariance of the error that is the pair's own.
-        common: (n, 3, 3) m^2, covariance of the error shared by the whole flight.
+        jacobian: (n, 3, 12) by the errors of the two frames: turn and shift (rad, m, ENU) of ref, then of src.
+        independent: (n, 3, 3) m^2, covariance of the error that no other pair has.
     """
 
     p_in_enu_m: Floats
-    own: Floats
-    common: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """One image of a pair, as far as its points are concerned.
-
-    Args:
-        camera: Its camera.
-        pose: Its pose.
-    """
-
-    camera: Camera
-    pose: Pose
+    jacobian: Floats
+    independent: Floats
 
 
 def world_points(
-    ref_px: Floats, depth_m: Floats, normal: Floats, pixel_sigma_m: Floats, ref_shot: Shot, src_shot: Shot
+    ref_px: Floats, depth_m: Floats, normal: Floats, pixel_sigma_m: Floats, ref_camera: Camera, placed: PlacedPair
 ) -> WorldPoints:
     """Points of one pair.
 
@@ -57,29 +44,16 @@ def world_points(
         depth_m: (n,).
         normal: (n, 3) of the depth, on the ref camera's axes.
         pixel_sigma_m: (n,) the depth's sigma by the matched positions alone; they move a point along its ref ray.
-        ref_shot: The image that has the depth.
-        src_shot: The other.
+        ref_camera: Camera of ref.
+        placed: Both cameras as the depths were found with.
     """
-    ref, src = ref_shot.pose, src_shot.pose
-    v = ref_shot.camera.rays(ref_px) @ ref.rotation.T
+    ref, src = placed.ref, placed.src
+    v = ref_camera.rays(ref_px) @ ref.rotation.T
     p = depth_m[:, None] * v
-    baseline = src.centre - ref.centre
-    q = p - baseline
+    q = p - (src.centre - ref.centre)
     by_src = v[:, :, None] * (normal @ ref.rotation.T)[:, None, :]
     by_ref = np.eye(3) - by_src
-    turn_ref, turn_src = -by_ref @ skew(p) @ ref.error_axes, -by_src @ skew(q) @ src.error_axes
-    own = (
-        _spread(by_ref * ref.own.position_m)
-        + _spread(by_src * src.own.position_m)
-        + _spread(turn_ref * ref.own.gimbal_rad)
-        + _spread(turn_src * src.own.gimbal_rad)
-        + _spread((v * pixel_sigma_m[:, None])[:, :, None])
-    )
-    # What all frames share: the same shift, and the same error of yaw, pitch and roll in both.
-    common = np.diag(ref.common.position_m**2) + _spread((turn_ref + turn_src) * ref.common.gimbal_rad)
-    return WorldPoints(ref.centre + p, own, np.broadcast_to(common, own.shape))
-
-
-def _spread(jacobian: Floats) -> Floats:
-    out: Floats = jacobian @ np.swapaxes(jacobian, -1, -2)
-    return out
+    by_cameras = np.concatenate([-by_ref @ skew(p), by_ref, -by_src @ skew(q), by_src], axis=2)
+    along = v * pixel_sigma_m[:, None]
+    independent = along[:, :, None] * along[:, None, :] + by_cameras @ placed.noise @ np.swapaxes(by_cameras, 1, 2)
+    return WorldPoints(ref.centre + p, by_cameras @ placed.gain, independent)

@@ -9,9 +9,28 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.flight import PairRow, columns
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """Matched rays, z = 1; all arrays may have the same leading axes.
+
+    Args:
+        ref: (..., n, 3) in ref.
+        src: (..., n, 3) in src.
+        noise: (..., n, 3) covariance xx, xy, yy on src's image plane.
+    """
+
+    ref: Floats
+    src: Floats
+    noise: Floats
+
+    def some(self, rows: Ints) -> Rays:
+        """Some of the matches: rows (..., m), which become the leading axes."""
+        return Rays(self.ref[rows], self.src[rows], self.noise[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +42,7 @@ class Matched:
         n_matches: Matches made, outliers included.
         ref_px: (n, 2) pixels of ref as given.
         src_px: (n, 2) pixels of src as given.
-        ref: (n, 3) rays of ref, z = 1.
-        src: (n, 3) rays of src, z = 1.
-        noise: (3, n) covariance xx, xy, yy on src's image plane.
+        rays: The same as rays.
         focal_px: Of src: what a radian of its rays is in pixels.
     """
 
@@ -33,13 +50,11 @@ class Matched:
     n_matches: int
     ref_px: Floats
     src_px: Floats
-    ref: Floats
-    src: Floats
-    noise: Floats
+    rays: Rays
     focal_px: float
 
     def __len__(self) -> int:
-        return len(self.ref)
+        return len(self.ref_px)
 
     @classmethod
     def of(cls, pair: PairRow, matches: pa.Table, cameras: Mapping[str, Camera]) -> Matched:
@@ -54,11 +69,12 @@ class Matched:
         ref_px, src_px = columns(kept, ("ref_u", "ref_v")), columns(kept, ("src_u", "src_v"))
         ref, src = cameras[pair.ref].rays(ref_px), cameras[pair.src].rays(src_px)
         noise = cameras[pair.src].plane_covariance(src, columns(kept, ("cov_uu", "cov_uv", "cov_vv")))
-        return cls(pair, matches.num_rows, ref_px, src_px, ref, src, noise, cameras[pair.src].focal_px)
+        rays = Rays(ref, src, np.ascontiguousarray(noise.T))
+        return cls(pair, matches.num_rows, ref_px, src_px, rays, cameras[pair.src].focal_px)
 
     def residuals_px(self, pose: RelativePose) -> Floats:
         """(n,) absolute epipolar residuals under a pose, as pixels of src."""
-        return np.abs(epipolar(self, pose.rotation.T, pose.centre).sine) * self.focal_px
+        return np.abs(epipolar(self.rays, pose.rotation.T, pose.centre).sine) * self.focal_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +92,7 @@ class Epipolar:
     jacobian: Floats
 
 
-def epipolar(matched: Matched, ref_from_src: Floats, centre: Floats) -> Epipolar:
+def epipolar(rays: Rays, ref_from_src: Floats, centre: Floats) -> Epipolar:
     """The epipolar residuals of matches.
 
     With d the ref ray, u the unit src ray on ref's axes and c the src centre, the residual is u . m, m the unit normal
@@ -84,20 +100,20 @@ def epipolar(matched: Matched, ref_from_src: Floats, centre: Floats) -> Epipolar
     d|. It does not change with the baseline's length.
 
     Args:
-        matched: The matches.
+        rays: The matches.
         ref_from_src: (..., 3, 3).
         centre: (..., 3) m, src's in ref.
     """
-    unit = matched.src / np.linalg.norm(matched.src, axis=1, keepdims=True)
+    unit = rays.src / np.linalg.norm(rays.src, axis=-1, keepdims=True)
     turned = unit @ np.swapaxes(ref_from_src, -1, -2)
-    plane = np.cross(centre[..., None, :], matched.ref)
+    plane = np.cross(centre[..., None, :], rays.ref)
     length = np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-12)
     plane = plane / length
     sine = np.sum(plane * turned, axis=-1)
-    by_shift = (np.cross(matched.ref, turned) - sine[..., None] * np.cross(matched.ref, plane)) / length
+    by_shift = (np.cross(rays.ref, turned) - sine[..., None] * np.cross(rays.ref, plane)) / length
     in_src = plane @ ref_from_src
-    across = (in_src - sine[..., None] * unit)[..., :2] * unit[:, 2:]
-    xx, xy, yy = matched.noise
+    across = (in_src - sine[..., None] * unit)[..., :2] * unit[..., 2:]
+    xx, xy, yy = np.moveaxis(rays.noise, -1, 0)
     variance = across[..., 0] * (across[..., 0] * xx + 2.0 * across[..., 1] * xy) + across[..., 1] ** 2 * yy
     jacobian = np.concatenate([np.cross(turned, plane), by_shift], axis=-1)
     return Epipolar(sine, np.sqrt(np.maximum(variance, 1e-24)), jacobian)

@@ -1,0 +1,189 @@
+"""A pair refined by itself: what its matches and the log say of the two cameras together.
+
+The relative pose is the robust maximum a posteriori of `relative`. The two absolute poses follow it by the covariance
+that the log gives them together, so that the points' place on earth profits too. With S the log's covariance of both
+cameras (12 x 12), L the way from it to the relative pose and G G^T the information of the matches,
+
+    K = S L^T G (G^T L S L^T G + I)^-1      error left = (I - K G^T L) error of the log + K noise
+
+which keeps every correlation: that of the two cameras, and that with other pairs through the frames they share.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.poses import (
+    PlacedPair,
+    Placement,
+    RelativePose,
+    joint_covariance,
+    relative_jacobian,
+    relative_placement,
+)
+from pipeline.refinement.logged import Log, as_logged
+from pipeline.refinement.matched import Matched, Rays, epipolar
+from pipeline.refinement.refusals import Refusal, refusal_after, refusal_before
+from pipeline.refinement.relative import CAUCHY_SCALE, Fits, Prior, fit, inverse, minimal_fits
+from pipeline.refinement.rows import PAIR, RefinedPair
+from pipeline.refinement.starts import homography_errors
+
+# More matches hardly make a pose more certain, but every one costs.
+_MOST_MATCHES = 1000
+_SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 96, 6, 300
+# Samples of few matches are followed to a pixel or so, not to a match's own twentieth.
+_SAMPLE_NOISE = 10.0
+_POLISHED = 4
+# What all matches of a pair have in common and their scatter does not show: found on rendered photos with exact lenses.
+_SHARED_PX = 0.02
+_CELLS = (8, 6)
+_UNSEEN = 1e-9
+# A pose farther from the log than this many sigmas means that the log's sigmas are too small, or that it lies.
+FAR_SIGMAS = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeFit:
+    """What the matches make of a relative pose.
+
+    Args:
+        error: (6,) of the logged one.
+        information: (6, 6) of the matches alone.
+        prior_scale: By how much the log's covariance had to be widened for the fit to be credible.
+        moved_sigmas: How far it is from the logged pose.
+    """
+
+    error: Floats
+    information: Floats
+    prior_scale: float
+    moved_sigmas: float
+
+
+def refine_pair(log: Log, matched: Matched) -> RefinedPair:
+    """Refines one pair; the logged poses stand where the matches do not determine a pose.
+
+    Args:
+        log: The flight as logged.
+        matched: The pair's inliers.
+    """
+    if not len(matched):
+        return as_logged(log, matched)
+    ref, src = log.poses[matched.pair.ref], log.poses[matched.pair.src]
+    joint = joint_covariance(ref, src)
+    seen = relative_jacobian(ref, src)
+    pose = relative_placement(ref, src, seen @ joint @ seen.T)
+    try:
+        found = relative_fit(matched, pose)
+    except Refusal as refusal:
+        return as_logged(log, matched, str(refusal))
+    placed, covariance = _placed(log, matched, joint, found, pose)
+    after = relative_placement(placed.ref, placed.src, pose.covariance)
+    problem = ""
+    if found.moved_sigmas > FAR_SIGMAS:
+        problem = f"the matches put it {found.moved_sigmas:.0f} sigmas from the logged pose; sigmas widened"
+    before_px, after_px = matched.residuals_px(pose), matched.residuals_px(after)
+    return RefinedPair(placed, covariance, PAIR, before_px, after_px, found.moved_sigmas, problem)
+
+
+def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
+    """The relative pose of a pair by its matches, with the logged one as prior.
+
+    Args:
+        matched: The pair's inliers.
+        pose: src_from_ref as logged, with its covariance.
+
+    Raises:
+        Refusal: They do not determine it.
+    """
+    refusal_before(matched, pose)
+    rng = np.random.default_rng(zlib.crc32(matched.pair.pair_id.encode()))
+    rows = np.sort(rng.permutation(len(matched))[:_MOST_MATCHES])
+    rays, prior = matched.rays.some(rows), Prior.of(pose)
+    starts = _starts(rays, prior, rng)
+    fits = fit(rays, prior, starts)
+    best = int(np.argmin(fits.cost))
+    scatter = _scatter(rays, matched.ref_px[rows], prior, fits.error[best], fits.information[best])
+    shared_rad = _SHARED_PX / matched.focal_px
+    error, information = fits.error[best], _with_shared_turn(fits.information[best] / scatter, shared_rad)
+    refusal_after(rays, prior, fits, scatter)
+    moved = float(np.sqrt(error @ prior.information @ error))
+    scale = 1.0
+    if moved > FAR_SIGMAS:
+        # The log's sigmas are too small for what happened: the factor that makes the distance an ordinary one.
+        scale = moved**2 / 6.0
+        wide = Prior(prior.ref_from_src, prior.centre, prior.information / scale)
+        again: Fits = fit(rays, wide, error[None])
+        error, information = again.error[0], _with_shared_turn(again.information[0] / scatter, shared_rad)
+    return RelativeFit(error, information, scale, moved)
+
+
+def _starts(rays: Rays, prior: Prior, rng: np.random.Generator) -> Floats:
+    """(b, 6): the logged pose, the best of what few matches say, and what a plane would allow."""
+    n = len(rays.ref)
+    samples = np.argsort(rng.random((_SAMPLES, n)), axis=1)[:, :_SAMPLE_SIZE]
+    tried = minimal_fits(rays, prior, samples, _SAMPLE_NOISE)
+    tried = np.concatenate([tried, homography_errors(rays, prior)])
+    scored_on = rays.some(np.sort(rng.permutation(n)[:_SCORED_ON]))
+    found = epipolar(scored_on, *prior.moved(tried))
+    limit = _SAMPLE_NOISE * CAUCHY_SCALE
+    score = np.mean(np.minimum(np.abs(found.sine / found.sigma), limit), axis=1)
+    best = np.argsort(score, kind="stable")[:_POLISHED]
+    plane = np.arange(_SAMPLES, len(tried))
+    return np.concatenate([np.zeros((1, 6)), tried[best], tried[np.setdiff1d(plane, best)]])
+
+
+def _scatter(rays: Rays, ref_px: Floats, prior: Prior, error: Floats, information: Floats) -> float:
+    """The factor by which the matches' information is too large, from how alike the residuals of one place are.
+
+    An error of the lens, a moving shutter or a car makes neighbouring residuals alike; counting them as independent
+    would promise too much. The gradients are summed within cells of the image, and the spread of these sums is
+    compared with what independent residuals would have.
+    """
+    found = epipolar(rays, *prior.moved(error))
+    residual = found.sine / found.sigma
+    weight = residual / (1.0 + (residual / CAUCHY_SCALE) ** 2)
+    gradient = weight[:, None] * found.jacobian / found.sigma[:, None]
+    low, high = ref_px.min(axis=0), ref_px.max(axis=0)
+    at = np.minimum(((ref_px - low) / np.maximum(high - low, 1e-9) * _CELLS).astype(np.int64), np.array(_CELLS) - 1)
+    cell = at[:, 0] * _CELLS[1] + at[:, 1]
+    sums = np.stack([np.bincount(cell, gradient[:, i], _CELLS[0] * _CELLS[1]) for i in range(6)], axis=1)
+    spread = sums.T @ sums
+    # On axes on which the information is the unit matrix; the baseline's length, which is not seen, has none.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    seen = values > _UNSEEN * values[-1]
+    axes = scale[:, None] * vectors[:, seen] / np.sqrt(values[seen])
+    return max(1.0, float(np.mean(np.sum(axes * (spread @ axes), axis=0))))
+
+
+def _with_shared_turn(information: Floats, sigma_rad: float) -> Floats:
+    """The information once all rays of src may be turned by a small angle that no match shows (Woodbury)."""
+    turn = information[:, :3]
+    out: Floats = information - turn @ np.linalg.solve(np.eye(3) / sigma_rad**2 + turn[:3], turn.T)
+    return out
+
+
+def _placed(
+    log: Log, matched: Matched, joint: Floats, found: RelativeFit, pose: RelativePose
+) -> tuple[PlacedPair, Floats]:
+    """Both cameras after the fit, and the covariance of their errors."""
+    ref, src = log.poses[matched.pair.ref], log.poses[matched.pair.src]
+    seen = relative_jacobian(ref, src)
+    both = joint @ seen.T @ inverse(pose.covariance) @ found.error
+    new_ref = Placement(ref.rotation, ref.centre).moved(both[:6])
+    ref_from_src, centre = Prior.of(pose).moved(found.error)
+    # The relative pose as found, not as the two first-order moves would leave it.
+    new_src = Placement(new_ref.rotation @ ref_from_src, new_ref.centre + new_ref.rotation @ centre)
+    values, vectors = np.linalg.eigh(found.information)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    wide = found.prior_scale * joint
+    across = root.T @ relative_jacobian(new_ref, new_src)
+    kalman = wide @ across.T @ np.linalg.inv(across @ wide @ across.T + np.eye(6))
+    gain = np.eye(12) - kalman @ across
+    left = gain @ joint @ gain.T
+    noise = kalman @ kalman.T + (found.prior_scale - 1.0) * left
+    return PlacedPair(new_ref, new_src, gain, noise), left + noise

@@ -1,46 +1,59 @@
-"""fuse: kept depths of all pairs as georeferenced points with covariance, merged by voxel, tiled."""
+"""fuse: kept depths of all pairs as georeferenced points, one per physical point, with covariance, tiled."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from pydantic import Field, model_validator
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
-from pipeline.flight import camera_by_frame, cameras_of, image_locations, poses_of, selected_pairs
+from pipeline.flight import (
+    camera_by_frame,
+    cameras_of,
+    image_locations,
+    placed_pairs_of,
+    placements_of,
+    pose_errors_of,
+    selected_pairs,
+)
 from pipeline.geodesy.crs import local_output, output_crs
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.heights import ELLIPSOIDAL, is_orthometric
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.geodesy.transform import FrameTransform
+from pipeline.points.fusion import Counts, Limits, fused_tile
 from pipeline.points.geoparquet import TileFile, write_dataset
-from pipeline.points.observations import Scene, fused_tile, observations, spill
+from pipeline.points.observations import Scene, observations, spill
 from pipeline.points.stac import item
 
 
 class Config(StageConfig):
     """How observations become points."""
 
-    voxel_m: float = Field(0.25, gt=0.0, description="Edge of the cube within which observations are one point (m)")
+    voxel_m: float = Field(
+        0.0, ge=0.0, description="Edge of the cube of which only the surest point is kept; 0 keeps every point (m)"
+    )
     min_observations: int = Field(1, ge=1, description="Least number of pairs that saw a point (1)")
     tile_m: int = Field(250, gt=0, description="Edge of a tile, a multiple of voxel_m (m)")
 
     @model_validator(mode="after")
     def _whole(self) -> Config:
-        if abs(self.tile_m / self.voxel_m - round(self.tile_m / self.voxel_m)) > 1e-9:
+        if self.voxel_m and abs(self.tile_m / self.voxel_m - round(self.tile_m / self.voxel_m)) > 1e-9:
             raise ValueError("tile_m has to be a multiple of voxel_m")
         return self
 
 
 def run(config: Config, context: Context) -> str:
-    """Places the points and merges them tile by tile; writes `points`."""
+    """Places the points and fuses them tile by tile; writes `points`."""
     scene = _scene(context)
     context.record("crs", scene.transform.crs.name)
     context.record("heights", scene.transform.height_note)
@@ -50,20 +63,28 @@ def run(config: Config, context: Context) -> str:
     for _ in context.map(place, parts, shard=1, label="parts"):
         pass
     tiles = sorted(folder for folder in spilled.iterdir() if folder.is_dir())
-    merge = partial(_merge, scene, config, context.output("points"))
-    written = [tile for part in context.map(merge, tiles, shard=1, label="tiles") for tile in part]
+    limits = Limits(config.min_observations, config.voxel_m, config.tile_m)
+    fused = list(context.map(partial(_fuse, scene, limits, context.output("points")), tiles, shard=1, label="tiles"))
+    written = [tile for files, _ in fused for tile in files]
+    counts = Counts.sum(part for _, part in fused)
+    for name, number in asdict(counts).items():
+        context.record(name, number)
     rows = sum(tile.rows for tile in written)
     if not rows:
         raise NothingLeftError(
             "E-FUSE-01",
-            "no point was seen often enough",
-            found=f"{len(tiles)} tiles of observations",
-            expected=f"points seen by {config.min_observations} pairs",
+            "no point is left",
+            found=", ".join(f"{number} {name.replace('_', ' ')}" for name, number in asdict(counts).items()),
+            expected=f"points seen by {counted(config.min_observations, 'pair')}",
             hint="--set fuse.min_observations=1",
         )
     described = item(written, scene.transform.crs, "points", "Points by epipolar transfer, with covariance")
     (context.output("points") / "item.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
-    return f"{rows} points in {counted(len(written), 'tile')}, {scene.transform.crs.name}"
+    return f"{rows} points in {counted(len(written), 'tile')}, {scene.transform.crs.name}; {_left_out(counts)}"
+
+
+def _left_out(counts: Counts) -> str:
+    return f"{counted(counts.contradictory, 'contradictory track')} dropped"
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
@@ -97,8 +118,10 @@ def _scene(context: Context) -> Scene:
         image_locations(frames, str(facts["photo_root"]), context.path("images")),
         dict(zip(ids, usable.column("time").cast("int64").to_pylist(), strict=True)),
         camera_by_frame(frames, cameras_of(context.read("cameras"))),
-        poses_of(context.read("poses")),
+        placements_of(context.read("poses")),
+        pose_errors_of(context.read("pose_covariances")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
+        placed_pairs_of(context.read("relative_poses")),
         _transform(context.setting, facts),
         context.setting("depth.methods")[0],
     )
@@ -110,16 +133,24 @@ def _place(scene: Scene, folder: Path, tile_m: int, files: Sequence[Path]) -> in
     return len(files)
 
 
-def _merge(scene: Scene, config: Config, output: Path, folders: Sequence[Path]) -> list[TileFile]:
-    tables = (fused_tile(scene, folder, config.voxel_m, config.min_observations, config.tile_m) for folder in folders)
-    return write_dataset(output, (table for table in tables if table.num_rows), scene.transform.crs)
+def _fuse(scene: Scene, limits: Limits, output: Path, folders: Sequence[Path]) -> tuple[list[TileFile], Counts]:
+    counts = []
+
+    def tables() -> Iterator[pa.Table]:
+        for folder in folders:
+            table, of_tile = fused_tile(scene, folder, limits)
+            counts.append(of_tile)
+            if table.num_rows:
+                yield table
+
+    return write_dataset(output, tables(), scene.transform.crs), Counts.sum(counts)
 
 
 STAGE = Stage(
     "fuse",
-    2,
+    3,
     Config,
-    ("frames", "cameras", "poses", "pairs", "depths", "images"),
+    ("frames", "cameras", "poses", "pose_covariances", "relative_poses", "pairs", "depths", "images"),
     ("points",),
     run,
     reads=("ingest.crs", "ingest.geoid", "depth.methods"),

@@ -58,6 +58,7 @@ def synthetic_columns(count: int = COUNT, seed: int = 3) -> dict[str, object]:
         **floats,
         **colours,
         "n_pairs": rng.integers(1, 9, count),
+        "n_frames": rng.integers(2, 10, count),
         "frame_id": np.array([f"DJI_{i:04d}" for i in range(40)])[rng.integers(0, 40, count)],
         "time": pa.array(instants).cast(pa.timestamp("ns", "UTC")),
     }

@@ -29,6 +29,7 @@ _EXTRA = (
     ("cov_xz", "cov_xz", "f4", "covariance of x and z, m2"),
     ("cov_yz", "cov_yz", "f4", "covariance of y and z, m2"),
     ("n_pairs", "n_pairs", "u2", "pairs that saw the point"),
+    ("n_frames", "n_frames", "u2", "frames with a part in it"),
 )
 _COLOURS = ("red", "green", "blue")
 _UNIX_DAY, _GPS_DAY = date(1970, 1, 1), date(1980, 1, 6)

@@ -1,4 +1,4 @@
-"""Merging the observations in a voxel by inverse variance, without counting a shared pose error twice."""
+"""Merging tracks: which observations of a track agree, and their mean with its covariance."""
 
 from __future__ import annotations
 
@@ -6,88 +6,91 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import AnyArray, Floats, Ints
+from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.points.covariances import of_means, sums
+from pipeline.points.observed import Observed
+from pipeline.points.tracks import agreeing, least
 
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """One row per voxel.
+    """One row per track.
 
     Args:
         xyz: (m, 3) in the dataset's CRS.
-        covariance: (m, 3, 3) m^2, the common part included.
+        covariance: (m, 3, 3) m^2, of the whole error.
         n_pairs: (m,) pairs that saw it.
-        best: (m,) row of the observation with the least variance.
+        n_frames: (m,) frames whose images had a part in it.
+        best: (m,) row of the observation with the least sigma.
     """
 
     xyz: Floats
     covariance: Floats
     n_pairs: Ints
+    n_frames: Ints
     best: Ints
 
 
-def merge_voxels(xyz: Floats, own: Floats, common: Floats, pair: Ints, frames: Ints, voxel_m: float) -> Merged:
-    """Merges observations by voxel.
+def surest_of_pairs(observed: Observed, track: Ints) -> Bools:
+    """Which observations are the surest that their pair has of their track.
 
-    Every mean is weighted by one over the variance (the trace), not by the inverse matrix: that would throw a mean of
-    two long, nearly parallel ellipsoids out of the voxel they were found in. Points of one pair share that pair's pose
-    error, so within a pair the covariance is not divided. Pairs that share frames share their errors: they count as no
-    more independent ones than they have ref frames, src frames, or half their frames. The common part is that of the
-    best observation and never shrinks.
+    Two pixels of one frame in one track are the same point found twice, or one of them is another; the two errors are
+    the same, and a mean would gain nothing.
+    """
+    order = np.lexsort((observed.sigma_m, observed.pair, track))
+    key = np.stack([track, observed.pair], axis=1)[order]
+    out = np.empty(len(order), bool)
+    out[order] = np.concatenate([[True], np.any(key[1:] != key[:-1], axis=1)])[: len(order)]
+    return out
+
+
+def agreed(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> tuple[Bools, Bools]:
+    """Which observations agree with their track's surest one, and in which tracks most do.
+
+    A track whose surest observation is contradicted by as many others as confirm it, itself counted, holds a mistake,
+    and nothing tells where: of two that disagree neither is kept, for each of them is as likely the wrong one.
 
     Args:
-        xyz: (n, 3) in the dataset's CRS, m.
-        own: (n, 3, 3) m^2.
-        common: (n, 3, 3) m^2.
-        pair: (n,) number of the pair.
-        frames: (n, 2) numbers of the pair's ref and src frame.
-        voxel_m: Edge of a voxel.
+        observed: The observations.
+        track: (n,) 0 .. m - 1, none of them empty.
+        own: (n, 3, 3) m^2, the observations' whole covariances.
+        errors: Between the frames.
 
     Returns:
-        One row per occupied voxel, in order of the voxel's indices.
+        (n,) of the observations and (m,) of the tracks.
     """
-    voxels = np.floor(xyz / voxel_m).astype(np.int64)
-    _, voxel = np.unique(voxels, axis=0, return_inverse=True)
-    voxel = voxel.reshape(-1)
-    _, first, of_pair = np.unique(np.stack([voxel, pair], axis=1), axis=0, return_index=True, return_inverse=True)
-    of_pair = of_pair.reshape(-1)
-    share = _shares(own, of_pair)
-    pair_xyz, pair_own = _sum(xyz * share[:, None], of_pair), _sum(own * share[:, None, None], of_pair)
-    pair_voxel = voxel[first]
-    share = _shares(pair_own, pair_voxel)
-    covariance = _sum(pair_own * (share**2)[:, None, None], pair_voxel)
-    n_pairs = np.bincount(pair_voxel)
-    either = _distinct(np.tile(voxel, 2), frames.T.reshape(-1))
-    independent = np.minimum(np.minimum(_distinct(voxel, frames[:, 0]), _distinct(voxel, frames[:, 1])), either / 2.0)
-    best = _least(np.trace(own, axis1=1, axis2=2), voxel)
+    best = least(observed.sigma_m, track)
+    count = np.bincount(track)
+    rows = np.flatnonzero((count[track] > 1) & (best[track] != np.arange(len(track))))
+    agree = np.ones(len(track), bool)
+    agree[rows] = agreeing(observed, rows, best[track[rows]], own, errors)
+    return agree, 2 * np.bincount(track, agree) > count
+
+
+def merge(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> Merged:
+    """The mean of each track, weighted by one over the depth's variance.
+
+    The weights are scalars: inverse matrices would throw a mean of two long, nearly parallel ellipsoids out of both.
+
+    Args:
+        observed: The observations.
+        track: (n,) 0 .. m - 1, none of them empty.
+        own: (n, 3, 3) m^2, the observations' whole covariances.
+        errors: Between the frames.
+    """
+    weight = observed.sigma_m**-2.0
+    weight /= np.bincount(track, weight)[track]
     return Merged(
-        _sum(pair_xyz * share[:, None], pair_voxel),
-        covariance * (n_pairs / independent)[:, None, None] + common[best],
-        n_pairs,
-        best,
+        sums(observed.xyz * weight[:, None], track),
+        of_means(observed, weight, track, own, errors),
+        _distinct(track, observed.pair),
+        _distinct(np.repeat(track, 2), observed.frames.reshape(-1)),
+        least(observed.sigma_m, track),
     )
-
-
-def _shares(own: Floats, group: Ints) -> Floats:
-    """Weights by one over the trace that add up to 1 in each group."""
-    weight = 1.0 / np.trace(own, axis1=1, axis2=2)
-    out: Floats = weight / np.bincount(group, weight)[group]
-    return out
 
 
 def _distinct(group: Ints, values: Ints) -> Ints:
     """How many different values each group has."""
-    return np.bincount(np.unique(np.stack([group, values], axis=1), axis=0)[:, 0])
-
-
-def _sum(values: AnyArray, group: Ints) -> Floats:
-    """Sums of the rows of each group."""
-    flat = values.reshape(len(values), -1)
-    columns = [np.bincount(group, flat[:, i]).astype(np.float64) for i in range(flat.shape[1])]
-    return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])
-
-
-def _least(value: Floats, group: Ints) -> Ints:
-    """The row with the least value of each group."""
-    order = np.lexsort((value, group))
-    return order[np.unique(group[order], return_index=True)[1]]
+    keys = np.unique(group * (np.max(values, initial=0) + 1) + values)
+    return np.bincount(keys // (np.max(values, initial=0) + 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -51,6 +51,11 @@ class Observed:
     def take(self, rows: AnyArray) -> Observed:
         """Some of the observations, by index or mask."""
         return Observed(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Observed]) -> Observed:
+        """Several, one after the other; at least one."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
     def table(self) -> pa.Table:
         """As Arrow rows; the Jacobian in single precision, 1e-7 of the error that it carries."""

@@ -29,25 +29,46 @@ def tile_name(corner: Ints | tuple[int, int]) -> str:
     return f"t_{int(corner[0])}_{int(corner[1])}"
 
 
-def split(points: Floats, tile_m: int) -> Iterator[tuple[str, Ints]]:
+def tile_corner(name: str) -> Ints:
+    """(2,) the lower-left corner of a tile, m, from its name."""
+    return np.array([int(part) for part in name.split("_")[1:]], np.int64)
+
+
+def split(points: Floats, tile_m: int, boxes: tuple[Floats, Floats] | None = None) -> Iterator[tuple[str, Ints]]:
     """The tiles of points, by easting and then northing.
 
     Args:
         points: (n, 2) or (n, 3) x, y in the output CRS, m.
         tile_m: Edge of a tile, m.
+        boxes: (n, 2) lower-left and (n, 2) upper-right corners of a box about each point, m; all tiles that it touches
+            are the point's. Without boxes a point has one tile.
 
     Yields:
         The tile's name, and the rows (m,) of its points in `tile_order`.
     """
     if not len(points):
         return
-    corners = tile_corners(points, tile_m)
+    low, high = boxes or (points, points)
+    rows, corners = _touched(tile_corners(low, tile_m), tile_corners(high, tile_m), tile_m)
     unique, of_row = np.unique(corners, axis=0, return_inverse=True)
     by_tile = np.argsort(of_row.ravel(), kind="stable")
     bounds = np.searchsorted(of_row.ravel()[by_tile], np.arange(len(unique) + 1))
     for corner, start, stop in zip(unique, bounds[:-1], bounds[1:], strict=True):
-        rows = by_tile[start:stop]
-        yield tile_name(corner), rows[tile_order(points[rows], corner, tile_m)]
+        some = rows[by_tile[start:stop]]
+        yield tile_name(corner), some[tile_order(points[some], corner, tile_m)]
+
+
+def _touched(first: Ints, last: Ints, tile_m: int) -> tuple[Ints, Ints]:
+    """Rows and corners of all tiles from one corner to another, one row per point and tile."""
+    rows, corners = [], []
+    steps = (np.max(last - first, axis=0) // tile_m).tolist()
+    for i in range(steps[0] + 1):
+        for j in range(steps[1] + 1):
+            corner = first + np.array([i, j]) * tile_m
+            touched = np.flatnonzero((corner <= last).all(axis=1))
+            rows.append(touched)
+            corners.append(corner[touched])
+    return np.concatenate(rows), np.concatenate(corners)
 
 
 def tile_order(points: Floats, corner: Ints, tile_m: int) -> Ints:

@@ -1,0 +1,1 @@
+"""All frames refined together: a factor graph over the flight, points eliminated frame by frame."""

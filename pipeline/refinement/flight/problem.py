@@ -1,0 +1,173 @@
+"""The flight as one problem: Gauss-Newton over stars and logged poses, robust on both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.poses import Placement, Pose
+from pipeline.geometry.rotations import vector_from_rotation
+from pipeline.refinement.flight.elimination import Quadratic, eliminated, inverse_depths
+from pipeline.refinement.flight.graph import Graph, Solution
+from pipeline.refinement.flight.shared import Shared
+from pipeline.refinement.flight.stars import Stars
+
+STAR_SCALE = 3.0
+_MOST_STEPS = 25
+_WIDEST = 200.0
+_HALVING = 0.4
+_DONE = 1e-2
+# A frame's logged turn or shift farther off than this loses its say, as the square of the distance.
+FAR_SIGMAS = 5.0
+_LEAST_RAD, _LEAST_M = 1e-6, 1e-4
+
+
+@dataclass(slots=True)
+class State:
+    """Where everything is.
+
+    Args:
+        placed: Every frame.
+        constant: (c,) the shared unknowns.
+        bias: (k, 3) of the knots.
+        depths: Inverse depths of each ref frame's stars.
+    """
+
+    placed: list[Placement]
+    constant: Floats
+    bias: Floats
+    depths: list[Floats | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A flight to be refined.
+
+    Args:
+        logged: Every frame.
+        shared: What all get wrong alike.
+        stars: Of every ref frame that has any.
+    """
+
+    logged: Sequence[Pose]
+    shared: Shared
+    stars: Sequence[Stars]
+
+    def start(self) -> State:
+        """As logged."""
+        placed = [Placement(pose.rotation, pose.centre) for pose in self.logged]
+        knots = len(self.shared.knot_s)
+        return State(placed, np.zeros(len(self.shared.sigma)), np.zeros((knots, 3)), [None] * len(self.stars))
+
+    def off_log(self, state: State) -> Floats:
+        """(n, 6) turn and shift of every frame from its logged pose."""
+        return np.stack(
+            [
+                np.concatenate(
+                    [vector_from_rotation(now.rotation @ then.rotation.T), now.centre - then.centre]
+                )
+                for now, then in zip(state.placed, self.logged, strict=True)
+            ]
+        )
+
+    def own_sigmas_off(self, state: State) -> Floats:
+        """(n, 2) how far each frame's own turn and shift are from what the log allows, in its sigmas."""
+        off = self.off_log(state) - self._explained(state)
+        whitened = np.stack([_whitening(pose) @ one for pose, one in zip(self.logged, off, strict=True)])
+        return np.stack([np.linalg.norm(whitened[:, :3], axis=1), np.linalg.norm(whitened[:, 3:], axis=1)], axis=1)
+
+    def _explained(self, state: State) -> Floats:
+        """(n, 6) by the shared unknowns."""
+        shared = self.shared
+        out: Floats = shared.effect @ state.constant
+        share = shared.share[:, None]
+        out[:, 3:] += (1.0 - share) * state.bias[shared.before] + share * state.bias[shared.before + 1]
+        return out
+
+    def solve(self) -> tuple[State, Solution, list[Quadratic]]:
+        """The minimum, and the last linearisation."""
+        state, scale = self.start(), _WIDEST
+        for _ in range(_MOST_STEPS):
+            quadratics = self._quadratics(state, scale)
+            graph = self._graph(state, quadratics, 1.0)
+            found = graph.solved()
+            size = self._move(state, found, quadratics)
+            if scale <= STAR_SCALE and size < _DONE:
+                break
+            scale = max(STAR_SCALE, scale * _HALVING)
+        return state, found, self._quadratics(state, STAR_SCALE)
+
+    def final(self, state: State, quadratics: Sequence[Quadratic], scatter: float) -> Solution:
+        """The graph at the minimum with the information that the stars really have."""
+        return self._graph(state, quadratics, 1.0 / scatter).solved()
+
+    @property
+    def key_of_constant(self) -> int:
+        """Number of the constant shared unknowns; frames have theirs from 0."""
+        return len(self.logged)
+
+    def _quadratics(self, state: State, scale: float) -> list[Quadratic]:
+        out = []
+        for i, stars in enumerate(self.stars):
+            at = [state.placed[frame] for frame in stars.frames]
+            depth = inverse_depths(stars, at, state.depths[i], scale)
+            state.depths[i] = depth
+            out.append(eliminated(stars, at, depth, scale))
+        return out
+
+    def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float) -> Graph:
+        graph = Graph()
+        for stars, quadratic in zip(self.stars, quadratics, strict=True):
+            sizes = [6] * len(stars.frames)
+            keys = [int(frame) for frame in stars.frames]
+            graph.add_quadratic(keys, sizes, factor * quadratic.information, factor * quadratic.gradient)
+        self._add_log(graph, state)
+        self._add_shared(graph)
+        return graph
+
+    def _add_log(self, graph: Graph, state: State) -> None:
+        shared, n = self.shared, len(self.logged)
+        off, far = self.off_log(state), self.own_sigmas_off(state)
+        weight = np.where(far > FAR_SIGMAS, (FAR_SIGMAS / np.maximum(far, FAR_SIGMAS)) ** 2, 1.0)
+        for i, pose in enumerate(self.logged):
+            white = _whitening(pose) * np.repeat(np.sqrt(weight[i]), 3)[:, None]
+            terms = [(i, white)]
+            if len(shared.sigma):
+                terms.append((n, -white @ shared.effect[i]))
+            before = int(shared.before[i])
+            for knot, share in ((before, 1.0 - shared.share[i]), (before + 1, shared.share[i])):
+                terms.append((n + 1 + knot, -white[:, 3:] * share))
+            graph.add_rows(terms, -white @ off[i])
+
+    def _add_shared(self, graph: Graph) -> None:
+        shared, n = self.shared, len(self.logged)
+        if len(shared.sigma):
+            graph.add_rows([(n, np.diag(1.0 / shared.sigma))], np.zeros(len(shared.sigma)))
+        sigma = np.maximum(shared.bias_sigma_m, _LEAST_M)
+        graph.add_rows([(n + 1, np.diag(1.0 / sigma))], np.zeros(3))
+        for knot, holds in enumerate(shared.holds):
+            step = np.diag(1.0 / (sigma * np.sqrt(1.0 - holds**2)))
+            graph.add_rows([(n + 1 + knot, -holds * step), (n + 2 + knot, step)], np.zeros(3))
+
+    def _move(self, state: State, found: Solution, quadratics: Sequence[Quadratic]) -> float:
+        """Takes the step; returns its largest size per frame in units of the logged sigmas."""
+        n = len(self.logged)
+        steps = np.stack([found.at(i) for i in range(n)])
+        state.placed = [placed.moved(step) for placed, step in zip(state.placed, steps, strict=True)]
+        if len(self.shared.sigma):
+            state.constant = found.at(n)
+        state.bias = np.stack([found.at(n + 1 + knot) for knot in range(len(self.shared.knot_s))])
+        del quadratics
+        return max(float(np.linalg.norm(_whitening(p) @ step)) for p, step in zip(self.logged, steps, strict=True))
+
+
+def _whitening(pose: Pose) -> Floats:
+    """(6, 6) from a frame's own turn and shift to units of their sigmas."""
+    out = np.zeros((6, 6))
+    gimbal = np.maximum(pose.own.gimbal_rad, _LEAST_RAD)
+    out[:3, :3] = np.linalg.pinv(pose.error_axes) / gimbal[:, None]
+    out[3:, 3:] = np.diag(1.0 / np.maximum(pose.own.position_m, _LEAST_M))
+    return out

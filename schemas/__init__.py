@@ -17,7 +17,18 @@ from schemas.tracks import TRACKS
 TABLES: dict[str, TableSchema] = {
     schema.name: schema
     for schema in (
-        CAMERAS, FRAMES, TRACKS, CLOCKS, PAIRS, MATCHES, RELATIVE_POSES, POSES, POSE_COVARIANCES, DEPTHS, POINTS, SCORES,
+        CAMERAS,
+        FRAMES,
+        TRACKS,
+        CLOCKS,
+        PAIRS,
+        MATCHES,
+        RELATIVE_POSES,
+        POSES,
+        POSE_COVARIANCES,
+        DEPTHS,
+        POINTS,
+        SCORES,
     )
 }
 

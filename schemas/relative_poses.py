@@ -43,8 +43,8 @@ RELATIVE_POSES = TableSchema(
         Column(
             "gain",
             _OF_BOTH,
-            "Row-major 12x12: the errors of the two placed cameras (turn and shift of ref, then of src, ENU) by those of "
-            "the two frames, whose covariances are in `pose_covariances`; null for the unit matrix.",
+            "Row-major 12x12: the errors of the two placed cameras (turn and shift of ref, then of src, ENU) by those "
+            "of the two frames, whose covariances are in `pose_covariances`; null for the unit matrix.",
             "1",
             "ENU",
             nullable=True,
@@ -52,7 +52,7 @@ RELATIVE_POSES = TableSchema(
         Column(
             "noise",
             _OF_BOTH,
-            "Row-major 12x12 covariance of the error of the two placed cameras that is this pair's alone; null for none.",
+            "Row-major 12x12 covariance of the error of the two placed cameras that is the pair's; null for none.",
             "rad2, rad m, m2",
             "ENU",
             nullable=True,

@@ -84,7 +84,8 @@ def run(config: Config, context: Context) -> str:
 
 
 def _left_out(counts: Counts) -> str:
-    return f"{counted(counts.contradictory, 'contradictory track')} dropped"
+    outliers = counts.isolated + counts.looked_through
+    return f"{counted(counts.contradictory, 'contradictory track')} dropped, {counted(outliers, 'outlier')} removed"
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:

@@ -3,79 +3,122 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pyarrow as pa
 from pydantic import Field
 
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
-from pipeline.flight import camera_by_frame, cameras_of, poses_of, selected_pairs
+from pipeline.flight import camera_by_frame, cameras_of, column, poses_of, selected_pairs
 from pipeline.geometry.pose_errors import PoseErrors
-from pipeline.geometry.poses import Placement
-from pipeline.refinement.logged import Log, as_logged
+from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
+from pipeline.refinement.flight.stars import Stars, stars_by_ref
+from pipeline.refinement.logged import Log, as_logged, logged_frames
 from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
-from pipeline.refinement.rows import RefinedFrame, covariances_table, pair_row, poses_table
+from pipeline.refinement.pair import refine_pair, surest_frames
+from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, covariances_table, pair_row, poses_table
+from pipeline.refinement.telling import facts_of, sentence
 from schemas import MATCHES, RELATIVE_POSES
 
 
 class Config(StageConfig):
     """How the poses are refined."""
 
-    mode: Literal["none"] = Field("none", description="none passes the log's poses and their covariance on")
+    mode: Literal["none", "pair", "flight"] = Field(
+        "flight",
+        description="flight refines all frames together, with what they get wrong alike; pair refines every pair by "
+        "itself; none passes the log's poses and their covariance on",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Refiner:
+    """What pairs are refined with.
+
+    Args:
+        log: The flight as logged.
+        mode: The configured one.
+        flight: The flight refined as a whole, in that mode.
+    """
+
+    log: Log
+    mode: str
+    flight: RefinedFlight | None
+
+    def pair(self, matched: Matched) -> RefinedPair:
+        """One pair."""
+        if self.flight is not None:
+            return self.flight.pair(self.log, matched)
+        return refine_pair(self.log, matched) if self.mode == PAIR else as_logged(self.log, matched)
+
+    def part(self, files: Sequence[Path]) -> list[tuple[Matched, RefinedPair]]:
+        """The pairs of some parts of `matches`; of the matches only their number is needed any more."""
+        return [
+            (matched.without_matches(), self.pair(matched)) for file in files for matched in _matched(self.log, file)
+        ]
 
 
 def run(config: Config, context: Context) -> str:
     """Refines the logged poses on the matches; writes `relative_poses`, `poses` and `pose_covariances`."""
+    log = _log(context)
+    near = together(tuple(log.poses), list(log.pairs.values()))
+    parts = parquet_files(context.path("matches"))
+    flight = _flight(context, log, parts, near) if config.mode == FLIGHT else None
+    refiner = _Refiner(log, config.mode, flight)
+    found = {
+        matched.pair.pair_id: (matched, refined)
+        for some in context.map(refiner.part, parts, shard=1, label="parts")
+        for matched, refined in some
+    }
+    for pair_id, pair in log.pairs.items():
+        if pair_id not in found:
+            # A pair without a single match has its row too.
+            matched = Matched.of(pair, MATCHES.empty(), log.cameras)
+            found[pair_id] = matched, refiner.pair(matched)
+    pairs = [found[pair_id] for pair_id in log.pairs]
+    context.write("relative_poses", RELATIVE_POSES.from_rows(pair_row(*one) for one in pairs))
+    frames = logged_frames(log) if flight is None else flight.frames
+    if config.mode == PAIR:
+        frames = surest_frames(frames, pairs)
+    errors = PoseErrors.of_log(log.poses, near) if flight is None else flight.errors
+    context.write("poses", poses_table(frames))
+    context.write("pose_covariances", covariances_table(errors, near))
+    facts = facts_of([refined for _, refined in pairs], flight)
+    for name, value in facts.items():
+        context.record(name, value)
+    return sentence(counted(len(pairs), "pair"), config.mode, facts)
+
+
+def _log(context: Context) -> Log:
     frames = context.read("frames")
     cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
-    log = Log(poses_of(frames), cameras, pairs)
-    parts = parquet_files(context.path("matches"))
-    found: dict[str, dict[str, object]] = {}
-    for some in context.map(partial(_logged, log), parts, shard=1, label="parts"):
-        found.update(some)
-    # A pair without a single match has its row too.
-    none = MATCHES.empty()
-    rows = [found.get(name) or _row(log, Matched.of(pair, none, cameras)) for name, pair in pairs.items()]
-    context.write("relative_poses", RELATIVE_POSES.from_rows(rows))
-    near = together(tuple(log.poses), list(pairs.values()))
-    errors = PoseErrors.of_log(log.poses, near)
-    context.write("poses", poses_table(_frames(log, errors)))
-    context.write("pose_covariances", covariances_table(errors, near))
-    residuals = {str(row["pair_id"]): row["median_before_px"] for row in rows}
-    known = {pair_id: float(str(value)) for pair_id, value in residuals.items() if value is not None}
-    if not known:
-        return f"{counted(len(rows), 'pair')}, none with a match that agrees with its pose"
-    middle, worst = float(np.median(list(known.values()))), max(known, key=lambda pair_id: known[pair_id])
-    context.record("median_epipolar_residual_px", round(middle, 4))
-    return (
-        f"{counted(len(rows), 'pair')}, median epipolar residual under the logged poses {middle:.2f} px, "
-        f"worst {known[worst]:.1f} px ({worst})"
-    )
+    usable = frames.filter(frames.column("usable"))
+    times = usable.column("time").cast(pa.int64())
+    seconds = np.where(times.is_valid(), np.asarray(times.fill_null(0).to_numpy(), np.float64) * 1e-9, np.nan)
+    return Log(poses_of(frames), cameras, pairs, dict(zip(column(usable, "frame_id"), seconds.tolist(), strict=True)))
 
 
-def _logged(log: Log, files: Sequence[Path]) -> dict[str, dict[str, object]]:
-    out = {}
-    for file in files:
-        for pair_id, matches in by_pair(read_table(file, "matches")):
-            out[pair_id] = _row(log, Matched.of(log.pairs[pair_id], matches, log.cameras))
-    return out
+def _flight(context: Context, log: Log, parts: Sequence[Path], near: Sequence[tuple[str, str]]) -> RefinedFlight:
+    stars = [one for some in context.map(partial(_stars, log), parts, shard=1, label="parts") for one in some]
+    return refine_flight(log, stars, near)
 
 
-def _row(log: Log, matched: Matched) -> dict[str, object]:
-    return pair_row(matched.pair.pair_id, matched.n_matches, as_logged(log, matched))
+def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
+    number = {name: i for i, name in enumerate(log.poses)}
+    return [one for file in files for one in stars_by_ref(_matched(log, file), number)]
 
 
-def _frames(log: Log, errors: PoseErrors) -> dict[str, RefinedFrame]:
-    return {
-        name: RefinedFrame(Placement(pose.rotation, pose.centre), errors.between(name, name))
-        for name, pose in log.poses.items()
-    }
+def _matched(log: Log, file: Path) -> list[Matched]:
+    matches = by_pair(read_table(file, "matches"))
+    return [Matched.of(log.pairs[pair_id], some, log.cameras) for pair_id, some in matches]
 
 
 STAGE = Stage(

@@ -26,11 +26,11 @@ _BLOCK = 4_000_000
 def whole(observed: Observed, errors: PoseErrors) -> Floats:
     """(n, 3, 3) m^2 covariance of each observation by itself."""
     factors = observed.jacobian.reshape(-1, 3, 2, 6).transpose(0, 2, 1, 3)
-    found, known = _of_groups(factors, observed.frames, errors)
+    found, known = of_groups(factors, observed.frames, errors)
     if not known.all():
         # The frames of a pair themselves: twice the parts that each of the two makes.
         rows = np.flatnonzero(~known)
-        parts = (_of_groups(factors[rows, i : i + 1], observed.frames[rows, i : i + 1], errors)[0] for i in (0, 1))
+        parts = (of_groups(factors[rows, i : i + 1], observed.frames[rows, i : i + 1], errors)[0] for i in (0, 1))
         found[rows] = 2.0 * sum(parts)
     out: Floats = found + observed.independent
     return out
@@ -51,7 +51,7 @@ def of_differences(observed: Observed, one: Ints, other: Ints, own: Floats, erro
     """
     factors = observed.jacobian.reshape(-1, 3, 2, 6).transpose(0, 2, 1, 3)
     both = np.concatenate([factors[one], -factors[other]], axis=1)
-    found, known = _of_groups(both, np.concatenate([observed.frames[one], observed.frames[other]], axis=1), errors)
+    found, known = of_groups(both, np.concatenate([observed.frames[one], observed.frames[other]], axis=1), errors)
     found += observed.independent[one] + observed.independent[other]
     return np.where(known[:, None, None], found, 2.0 * (own[one] + own[other]))
 
@@ -80,7 +80,7 @@ def of_means(observed: Observed, weight: Floats, group: Ints, own: Floats, error
     for size in np.unique(count):
         some = np.flatnonzero(count == size)
         rows = first[some][:, None] + np.arange(size)
-        common[some], known[some] = _of_groups(by_frame[rows], frame[rows], errors)
+        common[some], known[some] = of_groups(by_frame[rows], frame[rows], errors)
     exact = common + sums(observed.independent * (weight**2)[:, None, None], group)
     if known.all():
         return exact
@@ -108,7 +108,7 @@ def squares(vectors: Floats, covariance: Floats) -> Floats:
     return out
 
 
-def _of_groups(factors: Floats, frames: Ints, errors: PoseErrors) -> tuple[Floats, Bools]:
+def of_groups(factors: Floats, frames: Ints, errors: PoseErrors) -> tuple[Floats, Bools]:
     """Covariance of sum_k factors_k e_k for groups of equally many frames' errors.
 
     Args:

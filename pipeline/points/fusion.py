@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -12,12 +12,14 @@ from pyarrow import feather
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.points.covariances import whole
+from pipeline.points.freespace import Views, looked_through
 from pipeline.points.geoparquet import tile_table
 from pipeline.points.merge import Merged, agreed, merge, surest_of_pairs
 from pipeline.points.observations import Scene
 from pipeline.points.observed import Observed
+from pipeline.points.outliers import isolated
 from pipeline.points.tiles import tile_corner, tile_corners, tile_order
-from pipeline.points.tracks import tracks
+from pipeline.points.tracks import least, tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,8 @@ class Counts:
         observations: Kept depths.
         disagreeing: Observations that their track's surest one contradicts.
         contradictory: Tracks without a majority that agrees.
+        isolated: Points that stand alone, seen by one pair.
+        looked_through: Points where more frames saw something behind than had a part in them.
         seen_too_seldom: Points of fewer pairs than asked for.
         thinned: Points that are not the surest of their cube.
     """
@@ -50,6 +54,8 @@ class Counts:
     observations: int = 0
     disagreeing: int = 0
     contradictory: int = 0
+    isolated: int = 0
+    looked_through: int = 0
     seen_too_seldom: int = 0
     thinned: int = 0
 
@@ -72,35 +78,67 @@ def fused_tile(scene: Scene, folder: Path, limits: Limits) -> tuple[pa.Table, Co
     """
     corner = tile_corner(folder.name)
     table = pa.concat_tables([feather.read_table(file) for file in sorted(folder.glob("*.arrow"))])
-    observed = Observed.of(table)
 
     def here(xyz: Floats) -> Bools:
         inside: Bools = (tile_corners(xyz, limits.tile_m) == corner).all(axis=1)
         return inside
 
-    own = whole(observed, scene.errors)
-    track = tracks(observed, own, scene.errors)
-    observed, own, track = _some(observed, own, track, surest_of_pairs(observed, track))
-    agree, sound = agreed(observed, track, own, scene.errors)
-    inside = here(observed.xyz)
-    best_of_unsound = np.flatnonzero(~sound[track] & inside)
-    counts = {
-        "observations": int(inside.sum()),
-        "disagreeing": int((~agree & sound[track] & inside).sum()),
-        "contradictory": len(np.unique(track[best_of_unsound])),
-    }
-    observed, own, track = _some(observed, own, track, agree & sound[track])
-    merged = merge(observed, track, own, scene.errors)
-    kept = here(merged.xyz)
-    often = merged.n_pairs >= limits.min_observations
-    counts["seen_too_seldom"] = int((kept & ~often).sum())
-    rows = np.flatnonzero(kept & often)
+    joined, counts = _joined(Observed.of(table), scene, here)
+    merged = merge(joined.observed, joined.track, joined.own, scene.errors)
+    left = here(merged.xyz)
+    for name, wrong in (
+        ("isolated", isolated(merged.xyz, _worst(merged.covariance), merged.n_frames)),
+        ("looked_through", looked_through(joined.observed, joined.track, merged, _views(scene))),
+        ("seen_too_seldom", merged.n_pairs < limits.min_observations),
+    ):
+        counts[name] = int((left & wrong).sum())
+        left &= ~wrong
+    rows = np.flatnonzero(left)
     if limits.voxel_m > 0.0:
         surest = surest_of_cubes(merged.xyz[rows], merged.covariance[rows], limits.voxel_m)
         counts["thinned"] = len(rows) - len(surest)
         rows = rows[surest]
     rows = rows[tile_order(merged.xyz[rows], corner, limits.tile_m)]
-    return _table(scene, observed, merged, rows, folder.name), Counts(**counts)
+    return _table(scene, joined.observed, merged, rows, folder.name), Counts(**counts)
+
+
+@dataclass(frozen=True, slots=True)
+class _Joined:
+    """Observations that agree, their whole covariances and their tracks, numbered without gaps."""
+
+    observed: Observed
+    own: Floats
+    track: Ints
+
+    def some(self, keep: Bools) -> _Joined:
+        track = np.unique(self.track[keep], return_inverse=True)[1].reshape(-1)
+        return _Joined(self.observed.take(keep), self.own[keep], track)
+
+
+def _joined(observed: Observed, scene: Scene, here: Callable[[Floats], Bools]) -> tuple[_Joined, dict[str, int]]:
+    own = whole(observed, scene.errors)
+    found = _Joined(observed, own, tracks(observed, own, scene.errors))
+    found = found.some(surest_of_pairs(observed, found.track))
+    agree, sound = agreed(found.observed, found.track, found.own, scene.errors)
+    inside, kept = here(found.observed.xyz), sound[found.track]
+    # A track lies where its surest observation does.
+    home = least(found.observed.sigma_m, found.track)
+    counts = {
+        "observations": int(here(observed.xyz).sum()),
+        "disagreeing": int((~agree & kept & inside).sum()),
+        "contradictory": int((~sound & inside[home]).sum()),
+    }
+    return found.some(agree & kept), counts
+
+
+def _views(scene: Scene) -> Views:
+    return Views(list(scene.errors.index), scene.cameras, scene.placements, scene.errors, scene.transform)
+
+
+def _worst(covariance: Floats) -> Floats:
+    """(n,) m: one sigma along the longest axis."""
+    out: Floats = np.sqrt(np.linalg.eigvalsh(covariance)[:, 2])
+    return out
 
 
 def surest_of_cubes(xyz: Floats, covariance: Floats, voxel_m: float) -> Ints:
@@ -119,12 +157,6 @@ def surest_of_cubes(xyz: Floats, covariance: Floats, voxel_m: float) -> Ints:
     new = np.any(cubes[order][1:] != cubes[order][:-1], axis=1)
     out: Ints = order[np.concatenate([[True], new])[: len(order)]]
     return out
-
-
-def _some(observed: Observed, own: Floats, track: Ints, keep: Bools) -> tuple[Observed, Floats, Ints]:
-    """Some observations, their tracks numbered anew."""
-    renumbered = np.unique(track[keep], return_inverse=True)[1].reshape(-1)
-    return observed.take(keep), own[keep], renumbered
 
 
 def _table(scene: Scene, observed: Observed, merged: Merged, rows: AnyArray, tile: str) -> pa.Table:

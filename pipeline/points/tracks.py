@@ -98,8 +98,8 @@ def _links(observed: Observed, star: Ints) -> Iterator[tuple[Ints, Ints, Floats]
         if len(home):
             here, first = np.unique(star[home], return_index=True)
             tree = cKDTree(observed.ref_px[home[first]])
-            distance, nearest = tree.query(observed.src_px[ends], distance_upper_bound=REACH_PX)
-            distance, nearest = np.atleast_1d(distance), np.atleast_1d(nearest)
+            nearby = tree.query(observed.src_px[ends], distance_upper_bound=REACH_PX)
+            distance, nearest = np.asarray(nearby[0]), np.asarray(nearby[1])
             found = np.isfinite(distance)
             yield ends[found], here[nearest[found]], distance[found]
             free = ends[~found]

@@ -7,9 +7,17 @@ from dataclasses import dataclass
 
 from pipeline.flight import PairRow
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.poses import PlacedPair, Placement, Pose, joint_covariance, relative_pose
+from pipeline.geometry.poses import (
+    PlacedPair,
+    Placement,
+    Pose,
+    common_covariance,
+    joint_covariance,
+    own_covariance,
+    relative_pose,
+)
 from pipeline.refinement.matched import Matched
-from pipeline.refinement.rows import NONE, RefinedPair
+from pipeline.refinement.rows import NONE, RefinedFrame, RefinedPair
 
 NO_INLIER = "no match agrees with the logged pose"
 
@@ -22,11 +30,21 @@ class Log:
         poses: By frame.
         cameras: By frame.
         pairs: By name.
+        time_s: Exposures by frame, s since 1970 UTC; NaN where not known.
     """
 
     poses: Mapping[str, Pose]
     cameras: Mapping[str, Camera]
     pairs: Mapping[str, PairRow]
+    time_s: Mapping[str, float]
+
+
+def logged_frames(log: Log) -> dict[str, RefinedFrame]:
+    """Every frame as logged."""
+    return {
+        name: RefinedFrame(Placement(pose.rotation, pose.centre), own_covariance(pose) + common_covariance(pose, pose))
+        for name, pose in log.poses.items()
+    }
 
 
 def as_logged(log: Log, matched: Matched, problem: str = "") -> RefinedPair:

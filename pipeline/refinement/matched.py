@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -71,6 +71,11 @@ class Matched:
         noise = cameras[pair.src].plane_covariance(src, columns(kept, ("cov_uu", "cov_uv", "cov_vv")))
         rays = Rays(ref, src, np.ascontiguousarray(noise.T))
         return cls(pair, matches.num_rows, ref_px, src_px, rays, cameras[pair.src].focal_px)
+
+    def without_matches(self) -> Matched:
+        """The pair alone."""
+        empty = np.empty((0, 3))
+        return replace(self, ref_px=empty[:, :2], src_px=empty[:, :2], rays=Rays(empty, empty, empty))
 
     def residuals_px(self, pose: RelativePose) -> Floats:
         """(n,) absolute epipolar residuals under a pose, as pixels of src."""

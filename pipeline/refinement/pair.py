@@ -12,6 +12,7 @@ which keeps every correlation: that of the two cameras, and that with other pair
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,8 @@ from pipeline.refinement.logged import Log, as_logged
 from pipeline.refinement.matched import Matched, Rays, epipolar
 from pipeline.refinement.refusals import Refusal, refusal_after, refusal_before
 from pipeline.refinement.relative import CAUCHY_SCALE, Fits, Prior, fit, inverse, minimal_fits
-from pipeline.refinement.rows import PAIR, RefinedPair
+from pipeline.refinement.rows import PAIR, RefinedFrame, RefinedPair
+from pipeline.refinement.scatter import SHARED_PX, scatter_of
 from pipeline.refinement.starts import homography_errors
 
 # More matches hardly make a pose more certain, but every one costs.
@@ -38,10 +40,6 @@ _SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 96, 6, 300
 # Samples of few matches are followed to a pixel or so, not to a match's own twentieth.
 _SAMPLE_NOISE = 10.0
 _POLISHED = 4
-# What all matches of a pair have in common and their scatter does not show: found on rendered photos with exact lenses.
-_SHARED_PX = 0.02
-_CELLS = (8, 6)
-_UNSEEN = 1e-9
 # A pose farther from the log than this many sigmas means that the log's sigmas are too small, or that it lies.
 FAR_SIGMAS = 6.0
 
@@ -89,6 +87,29 @@ def refine_pair(log: Log, matched: Matched) -> RefinedPair:
     return RefinedPair(placed, covariance, PAIR, before_px, after_px, found.moved_sigmas, problem)
 
 
+def surest_frames(
+    logged: Mapping[str, RefinedFrame], pairs: Iterable[tuple[Matched, RefinedPair]]
+) -> dict[str, RefinedFrame]:
+    """Every frame as the pair has it that knows it best; as logged where no pair was refined.
+
+    Args:
+        logged: Every frame as logged.
+        pairs: With their poses.
+    """
+    out = dict(logged)
+    best = dict.fromkeys(logged, 6.0)
+    for matched, found in pairs:
+        if found.mode != PAIR:
+            continue
+        both = (matched.pair.ref, found.placed.ref, slice(0, 6)), (matched.pair.src, found.placed.src, slice(6, 12))
+        for name, placed, part in both:
+            covariance = found.covariance[part, part]
+            left = float(np.trace(inverse(logged[name].covariance) @ covariance))
+            if left < best[name]:
+                best[name], out[name] = left, RefinedFrame(placed, covariance, True, found.problem)
+    return out
+
+
 def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
     """The relative pose of a pair by its matches, with the logged one as prior.
 
@@ -107,7 +128,7 @@ def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
     fits = fit(rays, prior, starts)
     best = int(np.argmin(fits.cost))
     scatter = _scatter(rays, matched.ref_px[rows], prior, fits.error[best], fits.information[best])
-    shared_rad = _SHARED_PX / matched.focal_px
+    shared_rad = SHARED_PX / matched.focal_px
     error, information = fits.error[best], _with_shared_turn(fits.information[best] / scatter, shared_rad)
     refusal_after(rays, prior, fits, scatter)
     moved = float(np.sqrt(error @ prior.information @ error))
@@ -137,27 +158,12 @@ def _starts(rays: Rays, prior: Prior, rng: np.random.Generator) -> Floats:
 
 
 def _scatter(rays: Rays, ref_px: Floats, prior: Prior, error: Floats, information: Floats) -> float:
-    """The factor by which the matches' information is too large, from how alike the residuals of one place are.
-
-    An error of the lens, a moving shutter or a car makes neighbouring residuals alike; counting them as independent
-    would promise too much. The gradients are summed within cells of the image, and the spread of these sums is
-    compared with what independent residuals would have.
-    """
+    """The factor by which the matches' information is too large."""
     found = epipolar(rays, *prior.moved(error))
     residual = found.sine / found.sigma
     weight = residual / (1.0 + (residual / CAUCHY_SCALE) ** 2)
     gradient = weight[:, None] * found.jacobian / found.sigma[:, None]
-    low, high = ref_px.min(axis=0), ref_px.max(axis=0)
-    at = np.minimum(((ref_px - low) / np.maximum(high - low, 1e-9) * _CELLS).astype(np.int64), np.array(_CELLS) - 1)
-    cell = at[:, 0] * _CELLS[1] + at[:, 1]
-    sums = np.stack([np.bincount(cell, gradient[:, i], _CELLS[0] * _CELLS[1]) for i in range(6)], axis=1)
-    spread = sums.T @ sums
-    # On axes on which the information is the unit matrix; the baseline's length, which is not seen, has none.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    seen = values > _UNSEEN * values[-1]
-    axes = scale[:, None] * vectors[:, seen] / np.sqrt(values[seen])
-    return max(1.0, float(np.mean(np.sum(axes * (spread @ axes), axis=0))))
+    return max(1.0, scatter_of(gradient, ref_px, information))
 
 
 def _with_shared_turn(information: Floats, sigma_rad: float) -> Floats:

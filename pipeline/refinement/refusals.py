@@ -41,9 +41,7 @@ def refusal_before(matched: Matched, pose: RelativePose) -> None:
     left = _left_by_a_turn(matched.rays)
     sigma = float(np.sqrt(np.median(matched.rays.noise[:, [0, 2]])))
     if left < max(_LEAST_PARALLAX_SIGMAS * sigma, _LEAST_PARALLAX):
-        raise Refusal(
-            f"nearly a pure rotation: a turn alone explains the matches to {left * matched.focal_px:.1f} px"
-        )
+        raise Refusal(f"nearly a pure rotation: a turn alone explains the matches to {left * matched.focal_px:.1f} px")
     if not np.linalg.norm(pose.centre) > 0.0:
         raise Refusal("the logged baseline is zero")
 
@@ -121,5 +119,5 @@ def _in_front(rays: Rays, prior: Prior, error: Floats) -> Floats:
     # s ref - t src = centre in least squares.
     aa, bb, ab = (np.sum(x * y, axis=1) for x, y in ((rays.ref, rays.ref), (src, src), (rays.ref, src)))
     ac, bc = rays.ref @ centre, src @ centre
-    ahead = (bb * ac - ab * bc > 0.0) & (ab * ac - aa * bc > 0.0)
-    return ahead.astype(np.float64)
+    out: Floats = ((bb * ac - ab * bc > 0.0) & (ab * ac - aa * bc > 0.0)).astype(np.float64)
+    return out

@@ -13,6 +13,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import PlacedPair, Placement, relative_jacobian, relative_placement
 from pipeline.geometry.rotations import gimbal_error_axes
+from pipeline.refinement.matched import Matched
 from schemas import POSE_COVARIANCES, POSES
 
 NONE, PAIR, FLIGHT = "none", "pair", "flight"
@@ -43,19 +44,24 @@ class RefinedPair:
     problem: str = ""
 
 
-def pair_row(pair_id: str, n_matches: int, found: RefinedPair) -> dict[str, object]:
-    """A row of `relative_poses`."""
+def pair_row(matched: Matched, found: RefinedPair) -> dict[str, object]:
+    """A row of `relative_poses`.
+
+    Args:
+        matched: The pair; its matches are not needed.
+        found: Its poses.
+    """
     placed = found.placed
     jacobian = relative_jacobian(placed.ref, placed.src)
     pose = relative_placement(placed.ref, placed.src, jacobian @ found.covariance @ jacobian.T)
     alone = found.mode == PAIR
     return {
-        **relative_pose_row(pair_id, pose),
+        **relative_pose_row(matched.pair.pair_id, pose),
         **placement_row(placed.ref, "ref_"),
         **placement_row(placed.src, "src_"),
         "gain": placed.gain.ravel().tolist() if alone else None,
         "noise": placed.noise.ravel().tolist() if alone else None,
-        "n_matches": n_matches,
+        "n_matches": matched.n_matches,
         "n_inliers": len(found.before_px),
         "rms_before_px": _rms(found.before_px),
         "median_before_px": _median(found.before_px),

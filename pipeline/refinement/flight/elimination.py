@@ -4,8 +4,8 @@ With d a star's ref ray, rho its inverse depth and R, C the cameras, the ray to 
 
     w = R_ref d + rho (C_ref - C_src),    y = R_src^T w,    x = y / y_z
 
-in units of 1 / rho, so that points far away are nothing special. A turn of ref moves w by d_ref x R_ref d, shifts move it by
-rho (e_ref - e_src), and a turn of src moves y by R_src^T (w x d_src).
+in units of 1 / rho, so that points far away are nothing special. A turn t of ref moves w by t x R_ref d, shifts move it
+by rho (e_ref - e_src), and a turn t of src moves y by R_src^T (w x t).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def inverse_depths(stars: Stars, at: list[Placement], start: Floats | None, scal
     """
     rho = _midpoints(stars, at) if start is None else start
     for _ in range(_DEPTH_STEPS):
-        found, w, y = residuals(stars, at, rho)
+        found, _, y = residuals(stars, at, rho)
         by_depth = _by_point(stars, y, _toward(stars, at))
         weight = _weights(found, scale)
         top = np.bincount(stars.star, weight * np.sum(by_depth * found, axis=1), len(rho))
@@ -180,7 +180,8 @@ def _by_lens(stars: Stars, at: list[Placement], y: Floats, lens: LensChange) -> 
 
 def _summed(values: Floats, stars: Stars, n: int) -> Floats:
     """(n, c) sums of rows (m, c) by star."""
-    return np.stack([np.bincount(stars.star, column, n) for column in values.T], axis=1)
+    out: Floats = np.stack([np.bincount(stars.star, column, n) for column in values.T], axis=1)
+    return out
 
 
 def _midpoints(stars: Stars, at: list[Placement]) -> Floats:
@@ -197,4 +198,5 @@ def _midpoints(stars: Stars, at: list[Placement]) -> Floats:
     best = np.lexsort((-sine, stars.star))
     first = best[np.searchsorted(stars.star[best], np.arange(len(stars.ray)))]
     length = float(np.linalg.norm(apart, axis=1).max())
-    return np.clip(rho[first], 1.0 / (1000.0 * length), 1.0 / (0.1 * length))
+    out: Floats = np.clip(rho[first], 1.0 / (1000.0 * length), 1.0 / (0.1 * length))
+    return out

@@ -66,9 +66,7 @@ class Problem:
         """(n, 6) turn and shift of every frame from its logged pose."""
         return np.stack(
             [
-                np.concatenate(
-                    [vector_from_rotation(now.rotation @ then.rotation.T), now.centre - then.centre]
-                )
+                np.concatenate([vector_from_rotation(now.rotation @ then.rotation.T), now.centre - then.centre])
                 for now, then in zip(state.placed, self.logged, strict=True)
             ]
         )
@@ -87,18 +85,18 @@ class Problem:
         out[:, 3:] += (1.0 - share) * state.bias[shared.before] + share * state.bias[shared.before + 1]
         return out
 
-    def solve(self) -> tuple[State, Solution, list[Quadratic]]:
-        """The minimum, and the last linearisation."""
+    def solve(self) -> tuple[State, list[Quadratic]]:
+        """The minimum, and its linearisation."""
         state, scale = self.start(), _WIDEST
         for _ in range(_MOST_STEPS):
             quadratics = self._quadratics(state, scale)
             graph = self._graph(state, quadratics, 1.0)
             found = graph.solved()
-            size = self._move(state, found, quadratics)
+            size = self._move(state, found)
             if scale <= STAR_SCALE and size < _DONE:
                 break
             scale = max(STAR_SCALE, scale * _HALVING)
-        return state, found, self._quadratics(state, STAR_SCALE)
+        return state, self._quadratics(state, STAR_SCALE)
 
     def final(self, state: State, quadratics: Sequence[Quadratic], scatter: float) -> Solution:
         """The graph at the minimum with the information that the stars really have."""
@@ -152,7 +150,7 @@ class Problem:
             step = np.diag(1.0 / (sigma * np.sqrt(1.0 - holds**2)))
             graph.add_rows([(n + 1 + knot, -holds * step), (n + 2 + knot, step)], np.zeros(3))
 
-    def _move(self, state: State, found: Solution, quadratics: Sequence[Quadratic]) -> float:
+    def _move(self, state: State, found: Solution) -> float:
         """Takes the step; returns its largest size per frame in units of the logged sigmas."""
         n = len(self.logged)
         steps = np.stack([found.at(i) for i in range(n)])
@@ -160,7 +158,6 @@ class Problem:
         if len(self.shared.sigma):
             state.constant = found.at(n)
         state.bias = np.stack([found.at(n + 1 + knot) for knot in range(len(self.shared.knot_s))])
-        del quadratics
         return max(float(np.linalg.norm(_whitening(p) @ step)) for p, step in zip(self.logged, steps, strict=True))
 
 

@@ -76,7 +76,11 @@ def shared_unknowns(poses: Sequence[Pose], time_s: Floats) -> Shared:
     level_m = float(np.sqrt(np.mean(whole_m[:2] ** 2)))
     speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
     sigma = np.array(
-        [*common_rad, min(_CLOCK_SIGMA_S, level_m / speed) if speed > 0.0 else 0.0, *([min(_LEVER_SIGMA_M, level_m)] * 3)]
+        [
+            *common_rad,
+            min(_CLOCK_SIGMA_S, level_m / speed) if speed > 0.0 else 0.0,
+            *([min(_LEVER_SIGMA_M, level_m)] * 3),
+        ]
     )
     effect = np.zeros((len(poses), 6, len(sigma)))
     for i, pose in enumerate(poses):

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.refinement.matched import Matched
+from pipeline.refinement.scatter import cells_of
 
 # Per ref frame. Three hundred well spread stars fix a pose to a hundredth of a pixel; more cost and tell nothing new.
 MOST_STARS = 300
@@ -43,6 +44,20 @@ class Stars:
     src_px: Floats
     xy: Floats
     root: Floats
+
+
+def stars_by_ref(matched: Sequence[Matched], number: Mapping[str, int]) -> list[Stars]:
+    """The stars of several pairs, one set per ref frame.
+
+    Args:
+        matched: The inliers of the pairs.
+        number: Of every frame.
+    """
+    by_ref: dict[str, list[Matched]] = {}
+    for some in matched:
+        if len(some):
+            by_ref.setdefault(some.pair.ref, []).append(some)
+    return [stars_of(of_ref, number) for of_ref in by_ref.values()]
 
 
 def stars_of(matched: Sequence[Matched], number: Mapping[str, int], most: int = MOST_STARS) -> Stars:
@@ -80,10 +95,7 @@ def stars_of(matched: Sequence[Matched], number: Mapping[str, int], most: int = 
 
 def _spread(pixels: Floats, seen: Ints, uncertain: Floats, most: int) -> Ints:
     """Rows of the best pixels of each cell of the image, then of the second best, and so on."""
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    cells = np.array(_CELLS)
-    at = np.minimum(((pixels - low) / np.maximum(high - low, 1e-9) * cells).astype(np.int64), cells - 1)
-    cell = at[:, 0] * cells[1] + at[:, 1]
+    cell = cells_of(pixels, _CELLS)
     order = np.lexsort((uncertain, -seen, cell))
     starts = np.searchsorted(cell[order], cell[order])
     rank = np.arange(len(order)) - starts

@@ -1,0 +1,142 @@
+"""A flight refined as a whole: from stars to poses, their covariances, and what all frames got wrong alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.arrays import Floats
+from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.geometry.poses import PlacedPair, relative_placement, relative_pose
+from pipeline.geometry.rotations import vector_from_rotation
+from pipeline.refinement.flight.elimination import Quadratic
+from pipeline.refinement.flight.graph import Solution
+from pipeline.refinement.flight.problem import FAR_SIGMAS, Problem, State
+from pipeline.refinement.flight.shared import shared_unknowns
+from pipeline.refinement.flight.stars import Stars
+from pipeline.refinement.logged import NO_INLIER, Log
+from pipeline.refinement.matched import Matched
+from pipeline.refinement.relative import inverse
+from pipeline.refinement.rows import FLIGHT, RefinedFrame, RefinedPair
+from pipeline.refinement.scatter import SHARED_PX, scatter_of
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A shared unknown.
+
+    Args:
+        name: With its unit.
+        value: By which the log has to be corrected.
+        sigma: Of it.
+        prior_sigma: What the log allowed.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    prior_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedFlight:
+    """A flight after refinement.
+
+    Args:
+        frames: By name.
+        errors: Covariances between frames.
+        found: The shared unknowns.
+        scatter: Factor by which the matches' information was too large.
+    """
+
+    frames: dict[str, RefinedFrame]
+    errors: PoseErrors
+    found: tuple[Found, ...]
+    scatter: float
+
+    def pair(self, log: Log, matched: Matched) -> RefinedPair:
+        """A pair as the flight places it.
+
+        Args:
+            log: The flight as logged.
+            matched: The pair's inliers.
+        """
+        pair = matched.pair
+        ref, src = self.frames[pair.ref].placed, self.frames[pair.src].placed
+        logged = relative_pose(log.poses[pair.ref], log.poses[pair.src])
+        now = relative_placement(ref, src, logged.covariance)
+        off = np.concatenate([vector_from_rotation(now.rotation.T @ logged.rotation), now.centre - logged.centre])
+        moved = float(np.sqrt(off @ inverse(logged.covariance) @ off))
+        return RefinedPair(
+            PlacedPair.plain(ref, src),
+            self.errors.joint(pair.ref, pair.src),
+            FLIGHT,
+            matched.residuals_px(logged),
+            matched.residuals_px(now),
+            moved,
+            "" if len(matched) else NO_INLIER,
+        )
+
+
+def refine_flight(log: Log, stars: Sequence[Stars], near: Sequence[tuple[str, str]]) -> RefinedFlight:
+    """Refines all frames together.
+
+    Args:
+        log: The flight as logged; frames are numbered in the order of its poses.
+        stars: Of every ref frame that has any.
+        near: Couples of frames whose covariance is wanted.
+    """
+    names, poses = list(log.poses), list(log.poses.values())
+    problem = Problem(poses, shared_unknowns(poses, np.array([log.time_s[name] for name in names])), stars)
+    state, quadratics = problem.solve()
+    scatter = _scatter(stars, quadratics)
+    solution = problem.final(state, quadratics, scatter)
+    errors = _errors(names, near, solution, [SHARED_PX / log.cameras[name].focal_px for name in names])
+    touched = {int(frame) for one in stars for frame in one.frames}
+    far = problem.own_sigmas_off(state)
+    frames = {
+        name: RefinedFrame(state.placed[i], errors.between(name, name), i in touched, _problem(far[i]))
+        for i, name in enumerate(names)
+    }
+    return RefinedFlight(frames, errors, _found(problem, state, solution), scatter)
+
+
+def _scatter(stars: Sequence[Stars], quadratics: Sequence[Quadratic]) -> float:
+    found = [
+        scatter_of(quadratic.gradients, one.ref_px, quadratic.information)
+        for one, quadratic in zip(stars, quadratics, strict=True)
+    ]
+    return max(1.0, float(np.mean(found))) if found else 1.0
+
+
+def _errors(
+    names: Sequence[str], near: Sequence[tuple[str, str]], solution: Solution, shared_rad: Sequence[float]
+) -> PoseErrors:
+    number = {name: i for i, name in enumerate(names)}
+    couples = [*((name, name) for name in names), *near]
+    numbers = np.array([(number[one], number[other]) for one, other in couples], np.int64)
+    blocks = list(solution.couples(numbers))
+    for i, sigma in enumerate(shared_rad):
+        # The first of the couples are every frame with itself.
+        blocks[i] = blocks[i] + np.diag([sigma**2] * 3 + [0.0] * 3)
+    return PoseErrors.of(names, ((*couple, block) for couple, block in zip(couples, blocks, strict=True)))
+
+
+def _found(problem: Problem, state: State, solution: Solution) -> tuple[Found, ...]:
+    shared = problem.shared
+    if not len(shared.sigma):
+        return ()
+    sigma = np.sqrt(np.diag(solution.covariance([problem.key_of_constant])))
+    rows = zip(shared.names, state.constant, sigma, shared.sigma, strict=True)
+    return tuple(Found(name, float(value), float(s), float(prior)) for name, value, s, prior in rows)
+
+
+def _problem(far: Floats) -> str:
+    said = [
+        f"the logged {what} is {sigmas:.0f} sigmas from what the images say, and was left aside"
+        for what, sigmas in zip(("attitude", "position"), far, strict=True)
+        if sigmas > FAR_SIGMAS
+    ]
+    return "; ".join(said)

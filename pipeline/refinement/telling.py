@@ -1,0 +1,82 @@
+"""What refinement found, as facts for the manifest and as a line for people."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.refinement.flight.flight import Found, RefinedFlight
+from pipeline.refinement.rows import FLIGHT, NONE, RefinedPair
+
+# An unknown of which the images leave less than half of what the log left open is worth a word.
+_TOLD = 0.5
+_WORDS = {
+    "boresight_yaw_rad": ("boresight yaw", "deg"),
+    "boresight_pitch_rad": ("boresight pitch", "deg"),
+    "boresight_roll_rad": ("boresight roll", "deg"),
+    "clock_s": ("clock", "s"),
+    "lever_forward_m": ("lever arm forward", "m"),
+    "lever_right_m": ("lever arm right", "m"),
+    "lever_down_m": ("lever arm down", "m"),
+}
+
+
+def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict[str, Any]:
+    """Figures for the manifest.
+
+    Args:
+        pairs: Every pair.
+        flight: The flight, where it was refined as a whole.
+    """
+    seen = [pair for pair in pairs if len(pair.before_px)]
+    reasons = Counter(pair.problem for pair in pairs if pair.mode == NONE and pair.problem)
+    out: dict[str, Any] = {
+        "median_epipolar_residual_px": _median([float(np.median(pair.before_px)) for pair in seen]),
+        "median_epipolar_residual_after_px": _median([float(np.median(pair.after_px)) for pair in seen]),
+        "share_of_pairs_refined": round(sum(pair.mode != NONE for pair in seen) / max(len(pairs), 1), 4),
+        "pairs_not_refined": dict(sorted(reasons.items())),
+    }
+    if flight is not None:
+        out["shared_errors"] = {_WORDS[found.name][0]: _figures(found) for found in flight.found}
+        out["frames_refined"] = sum(frame.refined for frame in flight.frames.values())
+        out["frames_off_the_log"] = {name: frame.problem for name, frame in flight.frames.items() if frame.problem}
+        out["information_divided_by"] = round(flight.scatter, 3)
+    return out
+
+
+def sentence(pairs: str, mode: str, facts: Mapping[str, Any]) -> str:
+    """The line for people.
+
+    Args:
+        pairs: How many, in words.
+        mode: The configured one.
+        facts: As `facts_of` has them.
+    """
+    before, after = facts["median_epipolar_residual_px"], facts["median_epipolar_residual_after_px"]
+    if before is None:
+        return f"{pairs}, none with a match that agrees with its pose"
+    if mode == NONE:
+        return f"{pairs}, median epipolar residual under the logged poses {before:.2f} px"
+    said = f"{pairs}, median epipolar residual {before:.2f} px as logged, {after:.2f} px refined"
+    if mode != FLIGHT:
+        return f"{said} ({facts['share_of_pairs_refined']:.0%} of the pairs; the others stay as logged)"
+    told = [
+        f"{name} {f['correction']:+.3g} ± {f['sigma']:.2g} {f['unit']}"
+        for name, f in facts["shared_errors"].items()
+        if f["sigma"] < _TOLD * f["prior_sigma"]
+    ]
+    return f"{said}; corrects {', '.join(told)}" if told else said
+
+
+def _figures(found: Found) -> dict[str, Any]:
+    unit = _WORDS[found.name][1]
+    scale = np.degrees(1.0) if unit == "deg" else 1.0
+    values = {"correction": found.value, "sigma": found.sigma, "prior_sigma": found.prior_sigma}
+    return {"unit": unit, **{name: float(f"{value * scale:.6g}") for name, value in values.items()}}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return round(float(np.median(values)), 4) if values else None

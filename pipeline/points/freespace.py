@@ -129,19 +129,21 @@ def _sure(claims: _Claims, observed: Observed, merged: Merged, views: Views, fra
     both = merged.covariance[claims.seen] + merged.covariance[claims.point]
     apart = gap > _SIGMAS * np.sqrt(np.einsum("ni,nij,nj->n", sight, both, sight))
     across = np.eye(3) - sight[:, :, None] * sight[:, None, :]
-    beside = across @ _relative(claims, observed, merged, views.errors, frame, to_crs) @ across
+    relative, kept = _relative(claims, observed, merged, views.errors, frame, to_crs)
+    beside = across @ relative @ across
     beside_m = np.sqrt(np.trace(beside, axis1=1, axis2=2) / 2.0)
     known = beside_m * views.cameras[name].focal_px <= _PLACED_PX * range_m
-    out: Bools = apart & known
+    out: Bools = apart & known & kept
     return out
 
 
 def _relative(
     claims: _Claims, observed: Observed, merged: Merged, errors: PoseErrors, frame: int, to_crs: Floats
-) -> Floats:
+) -> tuple[Floats, Bools]:
     """Covariance of a point's error less the displacement of the frame's ray there, by its best observation.
 
-    Where a covariance between the frames is not kept, it is infinite: nothing is known.
+    Returns:
+        (n, 3, 3) m^2 and (n,) whether every covariance between the frames is kept.
     """
     best = merged.best[claims.point]
     of_best = observed.jacobian[best].reshape(-1, 3, 2, 6).transpose(0, 2, 1, 3)
@@ -149,4 +151,4 @@ def _relative(
     factors = np.concatenate([of_best, -by_frame[:, None]], axis=1)
     frames = np.concatenate([observed.frames[best], np.full((len(best), 1), frame)], axis=1)
     found, known = of_groups(factors, frames, errors)
-    return np.where(known[:, None, None], found + observed.independent[best], np.inf)
+    return found + observed.independent[best], known

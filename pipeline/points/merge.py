@@ -48,8 +48,9 @@ def surest_of_pairs(observed: Observed, track: Ints) -> Bools:
 def agreed(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> tuple[Bools, Bools]:
     """Which observations agree with their track's surest one, and in which tracks most do.
 
-    A track whose surest observation is contradicted by as many others as confirm it, itself counted, holds a mistake,
-    and nothing tells where: of two that disagree neither is kept, for each of them is as likely the wrong one.
+    Where most contradict the surest one, it is the mistake: the surest of those that do stands for the track instead,
+    once. A track without a majority that agrees holds mistakes, and nothing tells which they are: of two that disagree
+    neither is kept, for each of them is as likely the wrong one.
 
     Args:
         observed: The observations.
@@ -60,12 +61,21 @@ def agreed(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> 
     Returns:
         (n,) of the observations and (m,) of the tracks.
     """
-    best = least(observed.sigma_m, track)
     count = np.bincount(track)
-    rows = np.flatnonzero((count[track] > 1) & (best[track] != np.arange(len(track))))
+    best = least(observed.sigma_m, track)
     agree = np.ones(len(track), bool)
-    agree[rows] = agreeing(observed, rows, best[track[rows]], own, errors)
-    return agree, 2 * np.bincount(track, agree) > count
+
+    def compare(rows: Ints) -> Bools:
+        agree[rows] = agreeing(observed, rows, best[track[rows]], own, errors)
+        sound: Bools = 2 * np.bincount(track, agree) > count
+        return sound
+
+    sound = compare(np.flatnonzero(count[track] > 1))
+    against = np.flatnonzero(~sound[track] & ~agree)
+    if len(against):
+        best[np.unique(track[against])] = against[least(observed.sigma_m[against], track[against])]
+        sound = compare(np.flatnonzero(~sound[track]))
+    return agree, sound
 
 
 def merge(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> Merged:

@@ -19,11 +19,15 @@ from pipeline.geometry.transfer import (
     variance_at,
 )
 from pipeline.geometry.triangulation import dlt_depth
+from pipeline.matching.verify import epipolar_residuals
 
 METHODS = ("epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical")
 NO_DEPTH = "the rays do not meet in front of the cameras"
 TOO_UNCERTAIN = "sigma above depth.max_relative_sigma"
 TOO_FAR = "beyond depth.max_range_m"
+MISSES = "the rays miss each other by more than depth.max_miss_sigmas"
+# A median of absolute values as the sigma of a Gaussian.
+_SIGMA_OF_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +37,15 @@ class Limits:
     Args:
         max_relative_sigma: Largest predicted sigma over depth.
         max_range_m: Largest distance from the ref camera.
+        max_miss_sigmas: How far the two rays may miss each other, in sigmas of pose and pixels.
+        usual_miss_rad: Median of how far the pair's rays miss each other under its pose: an uncalibrated lens makes all
+            miss by more than their sigmas, and that is no reason to distrust a few.
     """
 
     max_relative_sigma: float
     max_range_m: float
+    max_miss_sigmas: float = np.inf
+    usual_miss_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +149,19 @@ def _masked(found: Depths, rays: MatchedRays, pose: RelativePose, limits: Limits
         none = ~(np.isfinite(depth) & (depth > 0.0)) | behind_src
         sigma = np.sqrt(found.variance_m2)
         uncertain = ~(sigma <= limits.max_relative_sigma * depth)
+        misses = _misses(rays, pose, limits)
         far = depth * np.linalg.norm(ray, axis=0) > limits.max_range_m
-    reason = np.select([none, uncertain, far], [NO_DEPTH, TOO_UNCERTAIN, TOO_FAR], "")
+    reason = np.select([none, misses, uncertain, far], [NO_DEPTH, MISSES, TOO_UNCERTAIN, TOO_FAR], "")
     return reason == "", reason
+
+
+def _misses(rays: MatchedRays, pose: RelativePose, limits: Limits) -> Bools:
+    """Where the src ray is too far off the plane of the ref ray and the baseline for their errors."""
+    if not np.isfinite(limits.max_miss_sigmas):
+        return np.zeros(rays.ref.shape[1], np.bool_)
+    one = np.ones((1, rays.ref.shape[1]))
+    ref, src = (np.concatenate([xy, one]).T for xy in (rays.ref, rays.src))
+    found = epipolar_residuals(ref, src @ pose.rotation, pose, rays.noise.src)
+    allowed = np.maximum(found.sigma_rad, _SIGMA_OF_MEDIAN * limits.usual_miss_rad)
+    out: Bools = np.abs(found.angle_rad) > limits.max_miss_sigmas * allowed
+    return out

@@ -17,7 +17,7 @@ from pipeline.depthing import Limits, MatchedRays, MethodDepths, depths_by
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import dataset, parquet_files, read_table
-from pipeline.flight import PairRow, camera_by_frame, cameras_of, columns, relative_poses_of, selected_pairs
+from pipeline.flight import PairRow, camera_by_frame, cameras_of, column, columns, relative_poses_of, selected_pairs
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import RelativePose
@@ -40,6 +40,11 @@ class Config(StageConfig):
     max_relative_sigma: float = Field(
         0.25, gt=0.0, le=1.0, description="Largest predicted sigma over depth of a kept depth (1)"
     )
+    max_miss_sigmas: float = Field(
+        4.0,
+        gt=0.0,
+        description="How far the two rays of a kept depth may miss each other, in sigmas of pose and pixels (1)",
+    )
     max_range_m: float = Field(100.0, gt=0.0, description="Largest distance from the ref camera of a kept depth (m)")
 
 
@@ -49,15 +54,18 @@ class _Setting:
     pairs: Mapping[str, PairRow]
     cameras: Mapping[str, Camera]
     poses: Mapping[str, RelativePose]
+    usual_miss_px: Mapping[str, float]
 
 
 def run(config: Config, context: Context) -> str:
     """Computes the depths of all inliers, part by part; writes `depths`."""
+    relative = context.read("relative_poses")
     setting = _Setting(
         config,
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
         camera_by_frame(context.read("frames"), cameras_of(context.read("cameras"))),
-        relative_poses_of(context.read("relative_poses")),
+        relative_poses_of(relative),
+        dict(zip(column(relative, "pair_id"), np.nan_to_num(column(relative, "median_after_px")), strict=True)),
     )
     parts = parquet_files(context.path("matches"))
     context.map_tables("depths", partial(_part, setting), parts, shard=1, label="parts")
@@ -80,7 +88,8 @@ def _pair(setting: _Setting, pair_id: str, matches: pa.Table) -> list[pa.Table]:
     ref_px, src_px = columns(matches, ("ref_u", "ref_v")), columns(matches, ("src_u", "src_v"))
     covariance = columns(matches, ("cov_uu", "cov_uv", "cov_vv"))
     rays = MatchedRays.of(ref_px, src_px, setting.cameras[pair.ref], setting.cameras[pair.src], covariance)
-    limits = Limits(config.max_relative_sigma, config.max_range_m)
+    usual_rad = setting.usual_miss_px[pair_id] / setting.cameras[pair.src].focal_px
+    limits = Limits(config.max_relative_sigma, config.max_range_m, config.max_miss_sigmas, usual_rad)
     view = VirtualView(config.virtual_view)
     return [
         _table(

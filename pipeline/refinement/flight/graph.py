@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -15,8 +15,15 @@ _LEAST = 1e-12
 
 @dataclass(slots=True)
 class Graph:
-    """Gaussian factors on numbered unknowns; numbers are handed out by whoever fills it."""
+    """Gaussian factors on numbered unknowns; numbers are handed out by whoever fills it.
 
+    Args:
+        units: What one of each unknown's components is, by number. Matches fix turns to a microradian and leave a
+            flight free by metres; in units of what the log leaves open, elimination keeps its digits.
+        factors: gtsam's.
+    """
+
+    units: Mapping[int, Floats]
     factors: gtsam.GaussianFactorGraph = field(default_factory=gtsam.GaussianFactorGraph)
 
     def add_rows(self, terms: Sequence[tuple[int, Floats]], right: Floats) -> None:
@@ -28,7 +35,8 @@ class Graph:
         """
         # A conditional is the one factor that the wrapper makes of any number of unknowns.
         unit = gtsam.noiseModel.Unit.Create(len(right))
-        self.factors.push_back(gtsam.GaussianConditional(list(terms), 1, right, unit))
+        in_units = [(key, block * self.units[key]) for key, block in terms]
+        self.factors.push_back(gtsam.GaussianConditional(in_units, 1, right, unit))
 
     def add_quadratic(self, keys: Sequence[int], sizes: Sequence[int], information: Floats, gradient: Floats) -> None:
         """A quadratic x^T H x / 2 + g . x, of which g has to lie in the range of H."""
@@ -46,8 +54,9 @@ class Graph:
 
     def solved(self) -> Solution:
         """Eliminates everything."""
-        tree = self.factors.eliminateMultifrontal()
-        return Solution(tree, tree.optimize())
+        # By orthogonal turns: Cholesky in gtsam takes any large step between two pivots for a singular system.
+        tree = self.factors.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
+        return Solution(self.units, tree, tree.optimize())
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,23 +64,25 @@ class Solution:
     """An eliminated graph.
 
     Args:
+        units: As in `Graph`.
         tree: The Bayes tree.
         values: The minimum.
     """
 
+    units: Mapping[int, Floats]
     tree: gtsam.GaussianBayesTree
     values: gtsam.VectorValues
 
     def at(self, key: int) -> Floats:
         """The value of an unknown."""
-        out: Floats = np.asarray(self.values.at(key), np.float64)
+        out: Floats = np.asarray(self.values.at(key), np.float64) * self.units[key]
         return out
 
     def covariance(self, keys: Iterable[int]) -> Floats:
         """The joint covariance of some unknowns, in the order of their numbers as given."""
         listed = list(keys)
         joint = self.tree.jointMarginalCovariance(listed)
-        return np.block([[joint.at(a, b) for b in listed] for a in listed])
+        return np.block([[self._between(joint, a, b) for b in listed] for a in listed])
 
     def couples(self, couples: Ints) -> Iterable[Floats]:
         """The covariance between two unknowns each, couples (m, 2) sorted by the first."""
@@ -83,5 +94,9 @@ class Solution:
             others = [int(other) for other in couples[rows, 1]]
             joint = self.tree.jointMarginalCovariance(sorted({first, *others}))
             for row, other in zip(rows, others, strict=True):
-                out[row] = np.asarray(joint.at(first, other), np.float64)
+                out[row] = self._between(joint, first, other)
+        return out
+
+    def _between(self, joint: gtsam.JointMarginal, one: int, other: int) -> Floats:
+        out: Floats = np.asarray(joint.at(one, other), np.float64) * np.outer(self.units[one], self.units[other])
         return out

@@ -117,7 +117,7 @@ class Problem:
         return out
 
     def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float) -> Graph:
-        graph = Graph()
+        graph = Graph(self._units())
         for stars, quadratic in zip(self.stars, quadratics, strict=True):
             sizes = [6] * len(stars.frames)
             keys = [int(frame) for frame in stars.frames]
@@ -125,6 +125,14 @@ class Problem:
         self._add_log(graph, state)
         self._add_shared(graph)
         return graph
+
+    def _units(self) -> dict[int, Floats]:
+        """One sigma of every unknown, as the log has it."""
+        n, shared = len(self.logged), self.shared
+        units = {i: _own_sigmas(pose) for i, pose in enumerate(self.logged)}
+        units[n] = shared.sigma
+        bias = np.maximum(shared.bias_sigma_m, _LEAST_M)
+        return units | {n + 1 + knot: bias for knot in range(len(shared.knot_s))}
 
     def _add_log(self, graph: Graph, state: State) -> None:
         shared, n = self.shared, len(self.logged)
@@ -161,10 +169,14 @@ class Problem:
         return max(float(np.linalg.norm(_whitening(p) @ step)) for p, step in zip(self.logged, steps, strict=True))
 
 
+def _own_sigmas(pose: Pose) -> Floats:
+    """(6,) of a frame's own turn and shift: yaw, pitch, roll, then east, north, up."""
+    gimbal, position = np.maximum(pose.own.gimbal_rad, _LEAST_RAD), np.maximum(pose.own.position_m, _LEAST_M)
+    return np.concatenate([gimbal, position])
+
+
 def _whitening(pose: Pose) -> Floats:
     """(6, 6) from a frame's own turn and shift to units of their sigmas."""
-    out = np.zeros((6, 6))
-    gimbal = np.maximum(pose.own.gimbal_rad, _LEAST_RAD)
-    out[:3, :3] = np.linalg.pinv(pose.error_axes) / gimbal[:, None]
-    out[3:, 3:] = np.diag(1.0 / np.maximum(pose.own.position_m, _LEAST_M))
-    return out
+    out = np.eye(6)
+    out[:3, :3] = np.linalg.pinv(pose.error_axes)
+    return out / _own_sigmas(pose)[:, None]

@@ -61,9 +61,7 @@ def derivative(function: Callable[[Floats], Floats], size: int, step: float = 1e
 
 
 def with_errors(at: Placement, gimbal_rad: Floats, shift_m: Floats) -> Placement:
-    return Placement(
-        rotation_from_vector(gimbal_error_axes(at.rotation) @ gimbal_rad) @ at.rotation, at.centre + shift_m
-    )
+    return at.moved(np.concatenate([gimbal_error_axes(at.rotation) @ gimbal_rad, shift_m]))
 
 
 def moved_by(at: Placement, now: Placement) -> Floats:

@@ -33,6 +33,7 @@ EVERY_S = 2.0
 WAYS = {"forward": 0.0, "sideways": 90.0}
 
 Depths = Callable[[Floats, np.random.Generator], Floats]
+Spoiling = Callable[[Floats, np.random.Generator], Floats]
 
 
 def placement(angles_deg: Sequence[float], centre: Sequence[float]) -> Placement:
@@ -118,13 +119,14 @@ def matches_of(
     rng: np.random.Generator,
     points: tuple[Floats, Floats],
     noise: float = NOISE,
+    spoilt: Spoiling | None = None,
 ) -> Matched:
-    """Matches of a pair: ref pixels as they are, src pixels off by what their covariances say."""
+    """Matches of a pair: ref pixels as they are, src pixels off by what their covariances say, then spoilt."""
     ref_px, world = points
     src_px, seen = seen_in(truth[pair.src], world)
-    covariance = slanted(len(world), noise, int(rng.integers(1 << 30)))
-    src_px = src_px + drawn(rng, covariance)
-    return matched(pair, ref_px[seen], src_px[seen], covariance[seen])
+    covariance = slanted(len(world), noise, int(rng.integers(1 << 30)))[seen]
+    ref_px, src_px = ref_px[seen], src_px[seen] + drawn(rng, covariance)
+    return matched(pair, ref_px, src_px if spoilt is None else spoilt(src_px, rng), covariance)
 
 
 @dataclass(frozen=True)

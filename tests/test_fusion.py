@@ -38,11 +38,11 @@ GROUND = np.array([[-6.0, 32.0], [0.0, 36.0], [4.0, 40.0], [9.0, 33.0], [-3.0, 4
 CHAIN = [(1, 0), (2, 1), (3, 2), (4, 3)]
 
 
-def spread(frames: int) -> Floats:
+def spread(frames: int, common_m: float = COMMON_M) -> Floats:
     """(6 f, 6 f): every frame's own error, and one shift that all share."""
     out = np.diag(np.tile(OWN**2, frames))
     for axis in (3, 4, 5):
-        out[axis::6, axis::6] += COMMON_M**2
+        out[axis::6, axis::6] += common_m**2
     return out
 
 
@@ -168,7 +168,8 @@ SEEN = {
 def test_fused_points_are_as_far_off_as_they_say(seen: str) -> None:
     """Redraws of every error that the tables state: coverage of each axis, and the square in all directions."""
     pairs, gain, noise = SEEN[seen]
-    flight = Flight(pairs, gain=gain, noise=noise)
+    # What is common is no larger than the rest, or it would hide a mistake in that.
+    flight = Flight(pairs, covariance=spread(len(STATIONS), 0.03), gain=gain, noise=noise)
     rng, draws = np.random.default_rng(12), 400
     track = point_of(flight.observed())
     z, square = [], []
@@ -265,6 +266,14 @@ def test_means_by_the_book(seed: int, n: int, groups: int) -> None:
         mean = np.sum(weight[rows, None, None] * whole_jacobian[rows], axis=0)
         want = mean @ sigma @ mean.T + np.sum((weight[rows] ** 2)[:, None, None] * observed.independent[rows], axis=0)
         np.testing.assert_allclose(found[g], want, rtol=1e-9, atol=1e-9)
+    one, other = rng.integers(0, n, (2, n))
+    apart = whole_jacobian[one] - whole_jacobian[other]
+    np.testing.assert_allclose(
+        of_differences(observed, one, other, whole(observed, errors), errors),
+        apart @ sigma @ np.swapaxes(apart, 1, 2) + observed.independent[one] + observed.independent[other],
+        rtol=1e-9,
+        atol=1e-9,
+    )
     order = rng.permutation(n)
     mixed = observed.take(order)
     again = of_means(mixed, weight[order], group[order], whole(mixed, errors), errors)
@@ -314,6 +323,15 @@ def test_pixels_that_meet_while_their_points_do_not_are_two() -> None:
     track = tracked(flight, observed)
     assert track.max() + 1 == len(GROUND) + 1
     assert np.sum(track == track[0]) == 1
+
+
+def test_a_pixel_that_ends_two_pixels_from_a_star_is_not_its() -> None:
+    flight = Flight([(1, 0), (2, 1)])
+    observed = flight.observed()
+    observed.src_px[observed.pair == 1] += [1.5, 1.5]
+    assert tracked(flight, observed).max() + 1 == 2 * len(GROUND)
+    observed.src_px[observed.pair == 1] -= [0.6, 0.6]
+    assert tracked(flight, observed).max() + 1 == len(GROUND)
 
 
 def test_of_two_stars_of_a_frame_that_claim_one_the_nearer_has_it() -> None:

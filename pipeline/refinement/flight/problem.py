@@ -74,7 +74,7 @@ class Problem:
     def own_sigmas_off(self, state: State) -> Floats:
         """(n, 2) how far each frame's own turn and shift are from what the log allows, in its sigmas."""
         off = self.off_log(state) - self._explained(state)
-        whitened = np.stack([_whitening(pose) @ one for pose, one in zip(self.logged, off, strict=True)])
+        whitened = np.einsum("nij,nj->ni", self._whitening(), off)
         return np.stack([np.linalg.norm(whitened[:, :3], axis=1), np.linalg.norm(whitened[:, 3:], axis=1)], axis=1)
 
     def _explained(self, state: State) -> Floats:
@@ -126,10 +126,22 @@ class Problem:
         self._add_shared(graph)
         return graph
 
+    def _own_sigmas(self) -> Floats:
+        """(n, 6) of the frames' own turns and shifts: yaw, pitch, roll, then east, north, up."""
+        return np.stack(
+            [_own_sigmas(pose, loose) for pose, loose in zip(self.logged, self.shared.loose_m, strict=True)]
+        )
+
+    def _whitening(self) -> Floats:
+        """(n, 6, 6) from the frames' own turns and shifts to units of their sigmas."""
+        out = np.tile(np.eye(6), (len(self.logged), 1, 1))
+        out[:, :3, :3] = np.linalg.pinv(np.stack([pose.error_axes for pose in self.logged]))
+        return out / self._own_sigmas()[:, :, None]
+
     def _units(self) -> dict[int, Floats]:
         """One sigma of every unknown, as the log has it."""
         n, shared = len(self.logged), self.shared
-        units = {i: _own_sigmas(pose) for i, pose in enumerate(self.logged)}
+        units = dict(enumerate(self._own_sigmas()))
         units[n] = shared.sigma
         bias = np.maximum(shared.bias_sigma_m, _LEAST_M)
         return units | {n + 1 + knot: bias for knot in range(len(shared.knot_s))}
@@ -138,8 +150,9 @@ class Problem:
         shared, n = self.shared, len(self.logged)
         off, far = self.off_log(state), self.own_sigmas_off(state)
         weight = np.where(far > FAR_SIGMAS, (FAR_SIGMAS / np.maximum(far, FAR_SIGMAS)) ** 2, 1.0)
-        for i, pose in enumerate(self.logged):
-            white = _whitening(pose) * np.repeat(np.sqrt(weight[i]), 3)[:, None]
+        whitening = self._whitening()
+        for i in range(n):
+            white = whitening[i] * np.repeat(np.sqrt(weight[i]), 3)[:, None]
             terms = [(i, white)]
             if len(shared.sigma):
                 terms.append((n, -white @ shared.effect[i]))
@@ -166,17 +179,10 @@ class Problem:
         if len(self.shared.sigma):
             state.constant = found.at(n)
         state.bias = np.stack([found.at(n + 1 + knot) for knot in range(len(self.shared.knot_s))])
-        return max(float(np.linalg.norm(_whitening(p) @ step)) for p, step in zip(self.logged, steps, strict=True))
+        return float(np.linalg.norm(np.einsum("nij,nj->ni", self._whitening(), steps), axis=1).max())
 
 
-def _own_sigmas(pose: Pose) -> Floats:
+def _own_sigmas(pose: Pose, loose_m: Floats) -> Floats:
     """(6,) of a frame's own turn and shift: yaw, pitch, roll, then east, north, up."""
-    gimbal, position = np.maximum(pose.own.gimbal_rad, _LEAST_RAD), np.maximum(pose.own.position_m, _LEAST_M)
-    return np.concatenate([gimbal, position])
-
-
-def _whitening(pose: Pose) -> Floats:
-    """(6, 6) from a frame's own turn and shift to units of their sigmas."""
-    out = np.eye(6)
-    out[:3, :3] = np.linalg.pinv(pose.error_axes)
-    return out / _own_sigmas(pose)[:, None]
+    gimbal = np.maximum(pose.own.gimbal_rad, _LEAST_RAD)
+    return np.concatenate([gimbal, np.maximum(np.hypot(pose.own.position_m, loose_m), _LEAST_M)])

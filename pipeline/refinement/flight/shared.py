@@ -30,6 +30,7 @@ _BIAS_HOLDS_S = 3600.0
 _KNOT_EVERY_S = 60.0
 # Speeds come from neighbouring positions; over a longer gap a drone may have done anything.
 _LONGEST_GAP_S = 15.0
+_NEIGHBOURS = 2
 _NONE = 1e-9
 
 
@@ -45,6 +46,7 @@ class Shared:
         bias_sigma_m: (3,) east, north, up.
         before: (n,) the knot before each frame; the one after it follows.
         share: (n,) share of the knot after it.
+        loose_m: (n, 3) one sigma of a frame's own shift by what the clock does with velocities that are not known.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,7 @@ class Shared:
     bias_sigma_m: Floats
     before: Ints
     share: Floats
+    loose_m: Floats
 
     @property
     def holds(self) -> Floats:
@@ -69,19 +72,14 @@ def shared_unknowns(poses: Sequence[Pose], time_s: Floats) -> Shared:
         poses: As logged.
         time_s: (n,) exposures; NaN where not known.
     """
-    velocity = velocities(np.stack([pose.centre for pose in poses]), time_s)
+    velocity, rest = velocities(np.stack([pose.centre for pose in poses]), time_s)
     common_m = np.median([pose.common.position_m for pose in poses], axis=0)
     common_rad = np.median([pose.common.gimbal_rad for pose in poses], axis=0)
     whole_m = np.hypot(common_m, np.median([pose.own.position_m for pose in poses], axis=0))
     level_m = float(np.sqrt(np.mean(whole_m[:2] ** 2)))
     speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
-    sigma = np.array(
-        [
-            *common_rad,
-            min(_CLOCK_SIGMA_S, level_m / speed) if speed > 0.0 else 0.0,
-            *([min(_LEVER_SIGMA_M, level_m)] * 3),
-        ]
-    )
+    clock_s = min(_CLOCK_SIGMA_S, level_m / speed) if speed > 0.0 else 0.0
+    sigma = np.array([*common_rad, clock_s, *[min(_LEVER_SIGMA_M, level_m)] * 3])
     effect = np.zeros((len(poses), 6, len(sigma)))
     for i, pose in enumerate(poses):
         effect[i, :3, :3] = pose.error_axes
@@ -90,8 +88,9 @@ def shared_unknowns(poses: Sequence[Pose], time_s: Floats) -> Shared:
     names = np.array([*BORESIGHT, CLOCK, *LEVER])
     used = sigma > _NONE
     knot_s = _knots(time_s)
+    before, share = _between(time_s, knot_s)
     return Shared(
-        tuple(names[used].tolist()), sigma[used], effect[:, :, used], knot_s, common_m, *_between(time_s, knot_s)
+        tuple(names[used].tolist()), sigma[used], effect[:, :, used], knot_s, common_m, before, share, clock_s * rest
     )
 
 
@@ -103,19 +102,36 @@ def level_axes(rotation: Floats) -> Floats:
     return np.stack([np.cross([0.0, 0.0, 1.0], right), right, [0.0, 0.0, -1.0]], axis=1)
 
 
-def velocities(centre_m: Floats, time_s: Floats) -> Floats:
-    """(n, 3) m/s from the positions before and after each frame; zero where these are too far in time."""
-    out = np.zeros_like(centre_m)
+def velocities(centre_m: Floats, time_s: Floats) -> tuple[Floats, Floats]:
+    """Velocities from lines through a few neighbouring positions, and how far single steps are from these lines.
+
+    A drone is shaken between two exposures by more than its positions show. A clock that is off moves every frame by
+    its velocity at that instant; taking that from two positions alone would make the shaking look like knowledge.
+
+    Args:
+        centre_m: (n, 3).
+        time_s: (n,); NaN where not known.
+
+    Returns:
+        (n, 3) m/s, zero where the neighbours are too far in time; (n, 3) m/s one sigma of what the lines leave.
+    """
+    velocity, rest = np.zeros_like(centre_m), np.zeros_like(centre_m)
     known = np.flatnonzero(np.isfinite(time_s))
     order = known[np.argsort(time_s[known], kind="stable")]
     t, x = time_s[order], centre_m[order]
     step_s = np.diff(t)
     near = (step_s > 0.0) & (step_s <= _LONGEST_GAP_S)
+    leg = np.concatenate([[0], np.cumsum(~near)]) if len(order) else np.empty(0)
     for i, row in enumerate(order):
-        first, last = i - (i > 0 and near[i - 1]), i + (i < len(near) and near[i])
-        if last > first:
-            out[row] = (x[last] - x[first]) / (t[last] - t[first])
-    return out
+        rows = np.arange(max(i - _NEIGHBOURS, 0), min(i + _NEIGHBOURS + 1, len(order)))
+        rows = rows[leg[rows] == leg[i]]
+        if len(rows) < 2:
+            continue
+        since = t[rows] - t[rows].mean()
+        velocity[row] = since @ x[rows] / (since @ since)
+        steps = np.diff(x[rows], axis=0) / np.diff(t[rows])[:, None]
+        rest[row] = np.sqrt(np.mean((steps - velocity[row]) ** 2, axis=0))
+    return velocity, rest
 
 
 def _knots(time_s: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """The tables of a run folder: columns with type, unit, frame and meaning. Imports pyarrow and nothing of ours."""
 
 from schemas._columns import Column, SchemaError, TableSchema
-from schemas.cameras import CAMERAS
+from schemas.cameras import CAMERAS, REFINED_CAMERAS
 from schemas.clocks import CLOCKS
 from schemas.depths import DEPTHS
 from schemas.frames import FRAMES
@@ -26,6 +26,7 @@ TABLES: dict[str, TableSchema] = {
         RELATIVE_POSES,
         POSES,
         POSE_COVARIANCES,
+        REFINED_CAMERAS,
         DEPTHS,
         POINTS,
         SCORES,
@@ -42,6 +43,7 @@ __all__ = [
     "POINTS",
     "POSES",
     "POSE_COVARIANCES",
+    "REFINED_CAMERAS",
     "RELATIVE_POSES",
     "SCORES",
     "TABLES",

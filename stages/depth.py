@@ -63,7 +63,7 @@ def run(config: Config, context: Context) -> str:
     setting = _Setting(
         config,
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
-        camera_by_frame(context.read("frames"), cameras_of(context.read("cameras"))),
+        camera_by_frame(context.read("frames"), cameras_of(context.read("refined_cameras"))),
         relative_poses_of(relative),
         dict(zip(column(relative, "pair_id"), np.nan_to_num(column(relative, "median_after_px")), strict=True)),
     )
@@ -154,7 +154,7 @@ STAGE = Stage(
     "depth",
     3,
     Config,
-    ("frames", "cameras", "pairs", "matches", "relative_poses"),
+    ("frames", "refined_cameras", "pairs", "matches", "relative_poses"),
     ("depths",),
     run,
 )

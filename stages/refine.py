@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.engine.progress import counted
 from pipeline.engine.stage import Context, Stage, StageConfig
@@ -23,7 +23,7 @@ from pipeline.refinement.logged import Log, as_logged, logged_frames
 from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
 from pipeline.refinement.pair import refine_pair, surest_frames
-from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, covariances_table, pair_row, poses_table
+from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
 from pipeline.refinement.telling import facts_of, sentence
 from schemas import MATCHES, RELATIVE_POSES
 
@@ -36,6 +36,17 @@ class Config(StageConfig):
         description="flight refines all frames together, with what they get wrong alike; pair refines every pair by "
         "itself; none passes the log's poses and their covariance on",
     )
+    calibrate: bool = Field(
+        False,
+        description="Whether flight also finds the focal length and two radial terms of each camera, as far as the "
+        "images determine them",
+    )
+
+    @model_validator(mode="after")
+    def _as_a_whole(self) -> Config:
+        if self.calibrate and self.mode != FLIGHT:
+            raise ValueError('calibrate needs mode = "flight": two frames do not determine a lens')
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +77,11 @@ class _Refiner:
 
 
 def run(config: Config, context: Context) -> str:
-    """Refines the logged poses on the matches; writes `relative_poses`, `poses` and `pose_covariances`."""
+    """Refines the logged poses on the matches; writes poses, their covariances, relative poses and cameras."""
     log = _log(context)
     near = together(tuple(log.poses), list(log.pairs.values()))
     parts = parquet_files(context.path("matches"))
-    flight = _flight(context, log, parts, near) if config.mode == FLIGHT else None
+    flight = _flight(config, context, log, parts, near) if config.mode == FLIGHT else None
     refiner = _Refiner(log, config.mode, flight)
     found = {
         matched.pair.pair_id: (matched, refined)
@@ -90,6 +101,8 @@ def run(config: Config, context: Context) -> str:
     errors = PoseErrors.of_log(log.poses, near) if flight is None else flight.errors
     context.write("poses", poses_table(frames))
     context.write("pose_covariances", covariances_table(errors, near))
+    cameras = log.cameras if flight is None else flight.cameras
+    context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
     for name, value in facts.items():
         context.record(name, value)
@@ -106,9 +119,11 @@ def _log(context: Context) -> Log:
     return Log(poses_of(frames), cameras, pairs, dict(zip(column(usable, "frame_id"), seconds.tolist(), strict=True)))
 
 
-def _flight(context: Context, log: Log, parts: Sequence[Path], near: Sequence[tuple[str, str]]) -> RefinedFlight:
+def _flight(
+    config: Config, context: Context, log: Log, parts: Sequence[Path], near: Sequence[tuple[str, str]]
+) -> RefinedFlight:
     stars = [one for some in context.map(partial(_stars, log), parts, shard=1, label="parts") for one in some]
-    return refine_flight(log, stars, near)
+    return refine_flight(log, stars, near, calibrate=config.calibrate)
 
 
 def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
@@ -126,6 +141,6 @@ STAGE = Stage(
     3,
     Config,
     ("frames", "cameras", "pairs", "matches"),
-    ("relative_poses", "poses", "pose_covariances"),
+    ("relative_poses", "poses", "pose_covariances", "refined_cameras"),
     run,
 )

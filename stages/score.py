@@ -132,7 +132,7 @@ def _sweeps(folder: Path) -> tuple[Path, ...]:
 
 def _views(context: Context, wanted: set[str]) -> list[FrameView]:
     """The frames that have depths, in the order of `poses`."""
-    cameras = camera_by_frame(context.read("frames"), cameras_of(context.read("cameras")))
+    cameras = camera_by_frame(context.read("frames"), cameras_of(context.read("refined_cameras")))
     return [
         FrameView(frame_id, View(cameras[frame_id], pose.centre, pose.rotation))
         for frame_id, pose in placements_of(context.read("poses")).items()
@@ -163,7 +163,7 @@ STAGE = Stage(
     "score",
     1,
     Config,
-    ("frames", "cameras", "poses", "depths", "sweeps"),
+    ("frames", "refined_cameras", "poses", "depths", "sweeps"),
     ("scores",),
     run,
     reads=("ingest.geoid", "depth.methods"),

@@ -48,7 +48,8 @@ def export_colmap(run: Path, folder: Path) -> int:
     poses: Mapping[str, Placement | Pose] = (
         placements_of(read_table(refined, "poses")) if refined.exists() else poses_of(frames)
     )
-    cameras = cameras_of(read_table(run / "cameras.parquet", "cameras"))
+    name = "refined_cameras" if refined.exists() else "cameras"
+    cameras = cameras_of(read_table(run / f"{name}.parquet", name))
     usable = frames.filter(frames.column("usable"))
     rows = [row for row in usable.select(["frame_id", "image", "camera_id"]).to_pylist() if row["frame_id"] in poses]
     if not rows:

@@ -72,6 +72,10 @@ class Matched:
         rays = Rays(ref, src, np.ascontiguousarray(noise.T))
         return cls(pair, matches.num_rows, ref_px, src_px, rays, cameras[pair.src].focal_px)
 
+    def through(self, ref: Camera, src: Camera) -> Matched:
+        """The same pixels through other lenses; the noise is kept, for these hardly change it."""
+        return replace(self, rays=replace(self.rays, ref=ref.rays(self.ref_px), src=src.rays(self.src_px)))
+
     def without_matches(self) -> Matched:
         """The pair alone."""
         empty = np.empty((0, 3))

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import pyarrow as pa
 
-from pipeline.flight import placement_row, relative_pose_row
+from pipeline.flight import cameras_of, column, placement_row, relative_pose_row
 from pipeline.geometry.arrays import Floats
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import PlacedPair, Placement, relative_jacobian, relative_placement
 from pipeline.geometry.rotations import gimbal_error_axes
 from pipeline.refinement.matched import Matched
-from schemas import POSE_COVARIANCES, POSES
+from schemas import POSE_COVARIANCES, POSES, REFINED_CAMERAS
 
 NONE, PAIR, FLIGHT = "none", "pair", "flight"
 _SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
@@ -129,3 +130,25 @@ def covariances_table(errors: PoseErrors, together: Iterable[tuple[str, str]]) -
             "cov": [errors.between(*couple).ravel().tolist() for couple in couples],
         }
     )
+
+
+def cameras_table(given: pa.Table, frames: pa.Table, cameras: Mapping[str, Camera]) -> pa.Table:
+    """The table `refined_cameras`.
+
+    Args:
+        given: The table `cameras`.
+        frames: The table `frames`.
+        cameras: By frame, as refined.
+    """
+    ids = dict(zip(column(frames, "frame_id"), column(frames, "camera_id"), strict=True))
+    refined = {ids[name]: camera for name, camera in cameras.items()}
+    as_given = cameras_of(given)
+    rows = []
+    for row in given.to_pylist():
+        # A camera none of whose frames is usable has no part in anything.
+        now = refined.get(row["camera_id"], as_given[row["camera_id"]])
+        if now != as_given[row["camera_id"]]:
+            lens = {"model": now.model, "fx": now.fx, "fy": now.fy, "distortion": list(now.distortion)}
+            row |= {**lens, "source": f"{row['source']}, refined on the images"}
+        rows.append(row)
+    return REFINED_CAMERAS.from_rows(rows)

@@ -21,6 +21,9 @@ _WORDS = {
     "lever_forward_m": ("lever arm forward", "m"),
     "lever_right_m": ("lever arm right", "m"),
     "lever_down_m": ("lever arm down", "m"),
+    "focal": ("focal length, share", "1"),
+    "k1": ("k1", "1"),
+    "k2": ("k2", "1"),
 }
 
 

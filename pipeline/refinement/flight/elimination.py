@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.poses import Placement
 from pipeline.geometry.rotations import skew
+from pipeline.refinement.flight.lens import LensChange
 from pipeline.refinement.flight.stars import Stars
 
 _DEPTH_STEPS = 5
@@ -39,19 +40,6 @@ class Quadratic:
     gradient: Floats
     cost: float
     gradients: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class LensChange:
-    """How the stars' rays change with the lens, (…, 2, c) on the image plane.
-
-    Args:
-        ref: (n, 2, c).
-        src: (m, 2, c).
-    """
-
-    ref: Floats
-    src: Floats
 
 
 def residuals(stars: Stars, at: list[Placement], inverse_depth: Floats) -> tuple[Floats, Floats, Floats]:

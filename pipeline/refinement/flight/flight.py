@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.geometry.arrays import Floats
+from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import PlacedPair, relative_placement, relative_pose
 from pipeline.geometry.rotations import vector_from_rotation
 from pipeline.refinement.flight.elimination import Quadratic
 from pipeline.refinement.flight.graph import Solution
+from pipeline.refinement.flight.lens import NAMES, Lenses
 from pipeline.refinement.flight.problem import FAR_SIGMAS, Problem, State
 from pipeline.refinement.flight.shared import shared_unknowns
 from pipeline.refinement.flight.stars import Stars
@@ -47,12 +49,14 @@ class RefinedFlight:
     Args:
         frames: By name.
         errors: Covariances between frames.
+        cameras: Of every frame, by name.
         found: The shared unknowns.
         scatter: Factor by which the matches' information was too large.
     """
 
     frames: dict[str, RefinedFrame]
     errors: PoseErrors
+    cameras: dict[str, Camera]
     found: tuple[Found, ...]
     scatter: float
 
@@ -74,25 +78,36 @@ class RefinedFlight:
             self.errors.joint(pair.ref, pair.src),
             FLIGHT,
             matched.residuals_px(logged),
-            matched.residuals_px(now),
+            self._through(log, matched).residuals_px(now),
             moved,
             "" if len(matched) else NO_INLIER,
         )
 
+    def _through(self, log: Log, matched: Matched) -> Matched:
+        cameras = [self.cameras[name] for name in (matched.pair.ref, matched.pair.src)]
+        given = [log.cameras[name] for name in (matched.pair.ref, matched.pair.src)]
+        return matched if cameras == given else matched.through(*cameras)
 
-def refine_flight(log: Log, stars: Sequence[Stars], near: Sequence[tuple[str, str]]) -> RefinedFlight:
+
+def refine_flight(
+    log: Log, stars: Sequence[Stars], near: Sequence[tuple[str, str]], *, calibrate: bool = False
+) -> RefinedFlight:
     """Refines all frames together.
 
     Args:
         log: The flight as logged; frames are numbered in the order of its poses.
         stars: Of every ref frame that has any.
         near: Couples of frames whose covariance is wanted.
+        calibrate: Whether the lenses are unknown, too; what the images do not determine of them stays as given.
     """
     names, poses = list(log.poses), list(log.poses.values())
-    problem = Problem(poses, shared_unknowns(poses, np.array([log.time_s[name] for name in names])), stars)
-    state, quadratics = problem.solve()
-    scatter = _scatter(stars, quadratics)
-    solution = problem.final(state, quadratics, scatter)
+    lenses = Lenses.of([log.cameras[name] for name in names], unknown=calibrate)
+    problem = Problem(poses, shared_unknowns(poses, np.array([log.time_s[name] for name in names])), lenses, stars)
+    state, solution, scatter = _solved(problem)
+    if calibrate:
+        lenses = lenses.observed(_lens_sigma(problem, solution))
+        problem = replace(problem, lenses=lenses)
+        state, solution, scatter = _solved(problem)
     errors = _errors(names, near, solution, [SHARED_PX / log.cameras[name].focal_px for name in names])
     touched = {int(frame) for one in stars for frame in one.frames}
     far = problem.own_sigmas_off(state)
@@ -100,7 +115,25 @@ def refine_flight(log: Log, stars: Sequence[Stars], near: Sequence[tuple[str, st
         name: RefinedFrame(state.placed[i], errors.between(name, name), i in touched, _problem(far[i]))
         for i, name in enumerate(names)
     }
-    return RefinedFlight(frames, errors, _found(problem, state, solution), scatter)
+    now = lenses.changed(state.lens)
+    cameras = {name: now[lenses.of_frame[i]] for i, name in enumerate(names)}
+    found = (*_found(problem, state, solution), *_found_of_lenses(problem, state, solution))
+    return RefinedFlight(frames, errors, cameras, found, scatter)
+
+
+def _solved(problem: Problem) -> tuple[State, Solution, float]:
+    state, quadratics = problem.solve()
+    scatter = _scatter(problem.stars, quadratics)
+    return state, problem.final(state, quadratics, scatter), scatter
+
+
+def _lens_sigma(problem: Problem, solution: Solution) -> Floats:
+    """(3 c,) of what is found of the lenses; infinite for what was not looked for."""
+    out = np.full(len(problem.lenses.sigma), np.inf)
+    unknown = problem.lenses.unknown
+    if len(unknown):
+        out[unknown] = np.sqrt(np.diag(solution.covariance([problem.key_of_lens])))
+    return out
 
 
 def _scatter(stars: Sequence[Stars], quadratics: Sequence[Quadratic]) -> float:
@@ -131,6 +164,15 @@ def _found(problem: Problem, state: State, solution: Solution) -> tuple[Found, .
     sigma = np.sqrt(np.diag(solution.covariance([problem.key_of_constant])))
     rows = zip(shared.names, state.constant, sigma, shared.sigma, strict=True)
     return tuple(Found(name, float(value), float(s), float(prior)) for name, value, s, prior in rows)
+
+
+def _found_of_lenses(problem: Problem, state: State, solution: Solution) -> tuple[Found, ...]:
+    sigma = _lens_sigma(problem, solution)
+    names = [name for _ in problem.lenses.cameras for name in NAMES]
+    return tuple(
+        Found(names[k], float(state.lens[k]), float(sigma[k]), float(problem.lenses.sigma[k]))
+        for k in problem.lenses.unknown
+    )
 
 
 def _problem(far: Floats) -> str:

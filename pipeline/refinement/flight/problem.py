@@ -12,6 +12,7 @@ from pipeline.geometry.poses import Placement, Pose
 from pipeline.geometry.rotations import vector_from_rotation
 from pipeline.refinement.flight.elimination import Quadratic, eliminated, inverse_depths
 from pipeline.refinement.flight.graph import Graph, Solution
+from pipeline.refinement.flight.lens import Lenses
 from pipeline.refinement.flight.shared import Shared
 from pipeline.refinement.flight.stars import Stars
 
@@ -33,12 +34,14 @@ class State:
         placed: Every frame.
         constant: (c,) the shared unknowns.
         bias: (k, 3) of the knots.
+        lens: (3 c,) changes of the lenses.
         depths: Inverse depths of each ref frame's stars.
     """
 
     placed: list[Placement]
     constant: Floats
     bias: Floats
+    lens: Floats
     depths: list[Floats | None]
 
 
@@ -49,18 +52,20 @@ class Problem:
     Args:
         logged: Every frame.
         shared: What all get wrong alike.
+        lenses: What they were seen through.
         stars: Of every ref frame that has any.
     """
 
     logged: Sequence[Pose]
     shared: Shared
+    lenses: Lenses
     stars: Sequence[Stars]
 
     def start(self) -> State:
         """As logged."""
         placed = [Placement(pose.rotation, pose.centre) for pose in self.logged]
-        knots = len(self.shared.knot_s)
-        return State(placed, np.zeros(len(self.shared.sigma)), np.zeros((knots, 3)), [None] * len(self.stars))
+        knots, lens = np.zeros((len(self.shared.knot_s), 3)), np.zeros(len(self.lenses.sigma))
+        return State(placed, np.zeros(len(self.shared.sigma)), knots, lens, [None] * len(self.stars))
 
     def off_log(self, state: State) -> Floats:
         """(n, 6) turn and shift of every frame from its logged pose."""
@@ -107,13 +112,19 @@ class Problem:
         """Number of the constant shared unknowns; frames have theirs from 0."""
         return len(self.logged)
 
+    @property
+    def key_of_lens(self) -> int:
+        """Number of the unknown parameters of the lenses."""
+        return len(self.logged) + 1 + len(self.shared.knot_s)
+
     def _quadratics(self, state: State, scale: float) -> list[Quadratic]:
         out = []
-        for i, stars in enumerate(self.stars):
+        for i, as_given in enumerate(self.stars):
+            stars = self.lenses.rays(as_given, state.lens) if np.any(state.lens) else as_given
             at = [state.placed[frame] for frame in stars.frames]
             depth = inverse_depths(stars, at, state.depths[i], scale)
             state.depths[i] = depth
-            out.append(eliminated(stars, at, depth, scale))
+            out.append(eliminated(stars, at, depth, scale, self.lenses.derivatives(stars, state.lens)))
         return out
 
     def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float) -> Graph:
@@ -121,9 +132,11 @@ class Problem:
         for stars, quadratic in zip(self.stars, quadratics, strict=True):
             sizes = [6] * len(stars.frames)
             keys = [int(frame) for frame in stars.frames]
+            if len(self.lenses.unknown):
+                sizes, keys = [*sizes, len(self.lenses.unknown)], [*keys, self.key_of_lens]
             graph.add_quadratic(keys, sizes, factor * quadratic.information, factor * quadratic.gradient)
         self._add_log(graph, state)
-        self._add_shared(graph)
+        self._add_shared(graph, state)
         return graph
 
     def _own_sigmas(self) -> Floats:
@@ -144,6 +157,7 @@ class Problem:
         units = dict(enumerate(self._own_sigmas()))
         units[n] = shared.sigma
         bias = np.maximum(shared.bias_sigma_m, _LEAST_M)
+        units[self.key_of_lens] = self.lenses.sigma[self.lenses.unknown]
         return units | {n + 1 + knot: bias for knot in range(len(shared.knot_s))}
 
     def _add_log(self, graph: Graph, state: State) -> None:
@@ -161,10 +175,14 @@ class Problem:
                 terms.append((n + 1 + knot, -white[:, 3:] * share))
             graph.add_rows(terms, -white @ off[i])
 
-    def _add_shared(self, graph: Graph) -> None:
+    def _add_shared(self, graph: Graph, state: State) -> None:
         shared, n = self.shared, len(self.logged)
         if len(shared.sigma):
             graph.add_rows([(n, np.diag(1.0 / shared.sigma))], np.zeros(len(shared.sigma)))
+        unknown = self.lenses.unknown
+        if len(unknown):
+            off = state.lens[unknown] / self.lenses.sigma[unknown]
+            graph.add_rows([(self.key_of_lens, np.diag(1.0 / self.lenses.sigma[unknown]))], -off)
         sigma = np.maximum(shared.bias_sigma_m, _LEAST_M)
         graph.add_rows([(n + 1, np.diag(1.0 / sigma))], np.zeros(3))
         for knot, holds in enumerate(shared.holds):
@@ -178,6 +196,8 @@ class Problem:
         state.placed = [placed.moved(step) for placed, step in zip(state.placed, steps, strict=True)]
         if len(self.shared.sigma):
             state.constant = found.at(n)
+        if len(self.lenses.unknown):
+            state.lens[self.lenses.unknown] += found.at(self.key_of_lens)
         state.bias = np.stack([found.at(n + 1 + knot) for knot in range(len(self.shared.knot_s))])
         return float(np.linalg.norm(np.einsum("nij,nj->ni", self._whitening(), steps), axis=1).max())
 

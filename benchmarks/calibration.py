@@ -1,23 +1,28 @@
 """Predicted sigma against truth on the example's own matches, over redraws of the flight's pose error.
 
-usage: python benchmarks/calibration.py EXAMPLE RUN [REDRAWS]
+usage: python benchmarks/calibration.py EXAMPLE RUN [REDRAWS] [MODE...]
 
 A redraw gives every frame a new error of its own and the flight a new common one, with the sigmas of the run's `frames`
-table, about the true poses. The depths of real matches under such poses are then compared with the ray-cast truth. The
-matches stay the same, with the errors that they have, wrong ones too.
+table, about the true poses. These are refined as refine.mode says, by default every mode in turn, and the depths of
+real matches under the refined poses are compared with the ray-cast truth. The matches stay the same, with the errors
+that they have, wrong ones too.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from flight_truth import BETWEEN, LEGS, FlightTruth, TruePose, configured, reprojection_errors
+from flight_truth import BETWEEN, LEGS, FlightTruth, configured, reprojection_errors
+from redraws import redrawn_poses, square_of, turned
+from refitted import Matches, Refit
 
 from pipeline.depthing import Limits, MatchedRays, depths_by
+from pipeline.engine.executors import executor_for, usable_cores
 from pipeline.engine.tables import read_table
 from pipeline.flight import (
     PairRow,
@@ -28,23 +33,27 @@ from pipeline.flight import (
     poses_of,
     selected_pairs,
 )
-from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.geometry.poses import Pose, relative_pose
-from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.geometry.transfer import VirtualView
 
+__all__ = ["MEDIAN_SQUARE", "Outcome", "PairTruth", "groups", "limits_of", "outcomes", "pairs_with_truth", "turned"]
+
 METHODS = {"adaptive": "epitransfer", "DLT": "dlt"}
+MODES = ("none", "pair", "flight")
 REDRAWS, MATCHES_PER_PAIR, SEED = 200, 100, 11
 # A match farther from the truth is wrong, not noisy.
 WRONG_PX = 3.0
 # Of a chi-square distribution with two degrees of freedom.
 MEDIAN_SQUARE = 1.386
+# Redraws that a process takes at a time.
+_SHARD = 5
 
 
 def limits_of(run: Path) -> Limits:
     """What a published depth of a run has to keep, from its manifest."""
     depth = configured(run, "depth")
-    return Limits(depth["max_relative_sigma"], depth["max_range_m"])
+    return Limits(depth["max_relative_sigma"], depth["max_range_m"], depth.get("max_miss_sigmas", np.inf))
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +68,7 @@ class PairTruth:
         depth_m: (n,) true depths in ref, m.
         error_px: (n, 2) src pixel less the true one.
         covariance: (n, 3) px^2, stated for it: uu, uv, vv.
+        focal_px: Of src.
     """
 
     pair: PairRow
@@ -68,6 +78,7 @@ class PairTruth:
     depth_m: Floats
     error_px: Floats
     covariance: Floats
+    focal_px: float = 1.0
 
     @property
     def squares(self) -> Floats:
@@ -106,40 +117,9 @@ def pairs_with_truth(run: Path, truth: FlightTruth, per_pair: int = MATCHES_PER_
                 depth,
                 error,
                 covariance,
+                cameras[pair.src].focal_px,
             )
         )
-    return out
-
-
-def redrawn_poses(
-    truth: Mapping[str, TruePose], logged: Mapping[str, Pose], rng: np.random.Generator
-) -> dict[str, Pose]:
-    """Poses as another log of the same flight would give them, with the errors that the table's sigmas say."""
-    common_m, common_rad = rng.normal(size=3), rng.normal(size=3)
-    out = {}
-    for name, pose in logged.items():
-        own_m, own_rad = rng.normal(size=3), rng.normal(size=3)
-        shift = own_m * pose.own.position_m + common_m * pose.common.position_m
-        turn = own_rad * pose.own.gimbal_rad + common_rad * pose.common.gimbal_rad
-        true = truth[name]
-        out[name] = Pose(turned(true.rotation, turn), true.centre + shift, pose.own, pose.common)
-    return out
-
-
-def turned(rotation: Floats, turn_rad: Floats) -> Floats:
-    """An attitude (enu_from_cam) off by yaw, pitch and roll as `frames` defines them, written without the closed form.
-
-    Yaw is about the vertical, pitch about the camera's right axis, roll about the level forward axis.
-    """
-    yaw, pitch, roll = turn_rad
-    level_forward = np.cross([0.0, 0.0, 1.0], rotation[:, 0])
-    level_forward /= np.linalg.norm(level_forward)
-    out: Floats = (
-        rotation_from_vector(np.array([0.0, 0.0, -yaw]))
-        @ rotation_from_vector(roll * level_forward)
-        @ rotation
-        @ rotation_from_vector(np.array([pitch, 0.0, 0.0]))
-    )
     return out
 
 
@@ -174,38 +154,112 @@ class Outcome:
         residual = hit.sum(axis=1) - share * kept.sum(axis=1)
         return share, float(np.sqrt(np.sum(residual.astype(np.float64) ** 2)) / total)
 
+    def nees(self, rows: Bools) -> tuple[float, float]:
+        """Mean square of the kept depths' errors in units of their sigmas, wrong matches left out; 1 is Gaussian.
+
+        With its standard error from the spread between redraws or between pairs, whichever is larger: the errors of
+        the matched positions are the same in every redraw.
+        """
+        kept = self.kept & rows & ~self.wrong
+        square = np.where(kept, (self.error / np.where(kept, self.sigma, 1.0)) ** 2, 0.0)
+        total = int(kept.sum())
+        if not total:
+            return float("nan"), float("nan")
+        mean = float(square.sum() / total)
+        off = square - mean * kept
+        by_pair = np.bincount(self.pair, off.sum(axis=0))
+        return mean, float(max(np.linalg.norm(off.sum(axis=1)), np.linalg.norm(by_pair)) / total)
+
     def abs_rel(self, rows: Bools, common: Bools) -> float:
         """Mean relative error over the depths of `common` (redraws, n)."""
         relative = np.abs(self.error[:, rows]) / self.truth[rows]
         return float(np.mean(relative[common[:, rows]])) if np.any(common[:, rows]) else float("nan")
 
 
+@dataclass(frozen=True, slots=True)
+class _Setting:
+    """What a redraw is judged with.
+
+    Args:
+        pairs: Whose matches.
+        limits: What a published depth has to keep.
+        mode: One of MODES.
+        matches: All of the run, to refine on; None where nothing is refined.
+    """
+
+    pairs: Sequence[PairTruth]
+    limits: Limits
+    mode: str
+    matches: Matches | None
+
+    def refit(self, poses: Mapping[str, Pose]) -> Refit:
+        if self.matches is not None:
+            return self.matches.refitted(poses, self.mode)
+        relative = {pair.pair.pair_id: relative_pose(poses[pair.pair.ref], poses[pair.pair.src]) for pair in self.pairs}
+        return Refit(relative, dict.fromkeys(relative, 0.0), ())
+
+    def redraw(self, poses: Mapping[str, Pose]) -> tuple[dict[str, list[AnyArray]], Refit]:
+        """Depth, sigma and kept of every match, by method."""
+        refit = self.refit(poses)
+        stacks: dict[str, list[tuple[Floats, Floats, Bools]]] = {name: [] for name in METHODS}
+        for pair in self.pairs:
+            name = pair.pair.pair_id
+            limits = replace(self.limits, usual_miss_rad=refit.median_px[name] / pair.focal_px)
+            for method, stack in stacks.items():
+                rays, pose = pair.rays, refit.relative[name]
+                found = depths_by(METHODS[method], VirtualView.ADAPTIVE, 1.0, rays, pose, limits)
+                stack.append((found.depths.depth_m, np.sqrt(found.depths.variance_m2), found.kept))
+        return {name: [np.concatenate(part) for part in zip(*of, strict=True)] for name, of in stacks.items()}, refit
+
+
+def _redraws(setting: _Setting, drawn: Sequence[Mapping[str, Pose]]) -> list[tuple[dict[str, list[AnyArray]], Refit]]:
+    return [setting.redraw(poses) for poses in drawn]
+
+
 def outcomes(
-    pairs: Sequence[PairTruth], truth: FlightTruth, logged: Mapping[str, Pose], limits: Limits, redraws: int
+    pairs: Sequence[PairTruth],
+    truth: FlightTruth,
+    logged: Mapping[str, Pose],
+    limits: Limits,
+    redraws: int,
+    *,
+    mode: str = "none",
+    matches: Matches | None = None,
+    jobs: int = 1,
+    squares: list[Floats] | None = None,
 ) -> dict[str, Outcome]:
-    """Every method over the same redraws."""
+    """Every method over the same redraws.
+
+    Args:
+        pairs: Matches with a truth.
+        truth: Of the flight.
+        logged: Poses whose sigmas are redrawn.
+        limits: What a published depth has to keep.
+        redraws: How many.
+        mode: One of MODES.
+        matches: All of the run, to refine on.
+        jobs: Processes.
+        squares: Is filled with the squares of every pair's relative pose error, a row (pairs,) per redraw.
+    """
     rng = np.random.default_rng([SEED, 1])
-    n = sum(len(pair.depth_m) for pair in pairs)
-    stacks = {name: (np.empty((redraws, n)), np.empty((redraws, n)), np.zeros((redraws, n), bool)) for name in METHODS}
+    drawn = [redrawn_poses(truth.poses, logged, rng) for _ in range(redraws)]
+    setting = _Setting(pairs, limits, mode, matches)
+    with executor_for(jobs, None) as executor:
+        shards = (drawn[start : start + _SHARD] for start in range(0, redraws, _SHARD))
+        done = [one for some in executor.map(partial(_redraws, setting), shards) for one in some]
+    if squares is not None:
+        squares += [
+            np.array([square_of(refit.relative[pair.pair.pair_id], truth, pair.pair) for pair in pairs])
+            for _, refit in done
+        ]
     true_depth = np.concatenate([pair.depth_m for pair in pairs])
-    for k in range(redraws):
-        poses = redrawn_poses(truth.poses, logged, rng)
-        start = 0
-        for pair in pairs:
-            part = slice(start, start + len(pair.depth_m))
-            start = part.stop
-            pose = relative_pose(poses[pair.pair.ref], poses[pair.pair.src])
-            for name, method in METHODS.items():
-                found = depths_by(method, VirtualView.ADAPTIVE, 1.0, pair.rays, pose, limits)
-                error, sigma, kept = stacks[name]
-                error[k, part] = found.depths.depth_m - pair.depth_m
-                sigma[k, part] = np.sqrt(found.depths.variance_m2)
-                kept[k, part] = found.kept
     of_pair = np.repeat(np.arange(len(pairs)), [len(pair.depth_m) for pair in pairs])
     wrong = np.linalg.norm(np.concatenate([pair.error_px for pair in pairs]), axis=1) > WRONG_PX
-    return {
-        name: Outcome(error, sigma, true_depth, kept, of_pair, wrong) for name, (error, sigma, kept) in stacks.items()
-    }
+    out = {}
+    for name in METHODS:
+        depth, sigma, kept = (np.stack(part) for part in zip(*(found[name] for found, _ in done), strict=True))
+        out[name] = Outcome(depth - true_depth, sigma, true_depth, kept, of_pair, wrong)
+    return out
 
 
 def groups(pairs: Sequence[PairTruth]) -> dict[str, Bools]:
@@ -223,32 +277,58 @@ def lines(found: Mapping[str, Outcome], pairs: Sequence[PairTruth]) -> Iterator[
     for title, chosen in groups(pairs).items():
         for name, outcome in found.items():
             rows = chosen[outcome.pair]
-            one, two = outcome.within(1.0, rows), outcome.within(2.0, rows)
-            shares = f"{one[0]:8.1%} +-{one[1]:5.1%}{two[0]:8.1%} +-{two[1]:5.1%}{np.mean(outcome.kept[:, rows]):9.1%}"
-            rest = f"{outcome.abs_rel(rows, common):9.4f}{np.mean(outcome.wrong[rows]):8.2%}"
-            yield f"{title:26}{name:10}{shares}{rest}"
+            one, two, nees = outcome.within(1.0, rows), outcome.within(2.0, rows), outcome.nees(rows)
+            shares = f"{one[0]:8.1%} +-{one[1]:5.1%}{two[0]:8.1%} +-{two[1]:5.1%}{nees[0]:8.2f} +-{nees[1]:5.2f}"
+            rest = f"{np.mean(outcome.kept[:, rows]):9.1%}{outcome.abs_rel(rows, common):9.4f}"
+            yield f"{title:26}{name:10}{shares}{rest}{np.mean(outcome.wrong[rows]):8.2%}"
 
 
-def main(example: Path, run: Path, redraws: int) -> None:
-    """Prints the table."""
+def main(example: Path, run: Path, redraws: int, modes: Sequence[str]) -> None:
+    """Prints the tables."""
     truth = FlightTruth.of(example)
     logged = poses_of(read_table(run / "frames.parquet", "frames"))
-    pairs = pairs_with_truth(run, truth)
-    found = outcomes(pairs, truth, logged, limits_of(run), redraws)
+    matches = Matches.of(run)
+    having = {pair.pair_id for pair in matches.pairs}
+    pairs = [pair for pair in pairs_with_truth(run, truth) if pair.pair.pair_id in having]
     print(f"Kept depths within the predicted sigma, over {redraws} redraws of the pose error that `frames` states,")
-    print(f"on {len(pairs)} pairs x {MATCHES_PER_PAIR} of the run's matches; a Gaussian error has 68.3 % and 95.4 %\n")
-    print(f"{'':36}{'1 sigma':>16}{'2 sigma':>16}{'kept':>9}{'AbsRel':>9}{'wrong':>8}")
-    for line in lines(found, pairs):
-        print(line)
+    print(f"on {len(pairs)} pairs x {MATCHES_PER_PAIR} of the run's matches; a Gaussian error has 68.3 % and 95.4 %")
+    for mode in modes:
+        squares: list[Floats] = []
+        found = outcomes(
+            pairs,
+            truth,
+            logged,
+            limits_of(run),
+            redraws,
+            mode=mode,
+            matches=matches,
+            jobs=usable_cores(),
+            squares=squares,
+        )
+        print(f"\nrefine.mode = {mode}")
+        heads = f"{'1 sigma':>16}{'2 sigma':>16}{'squares':>16}{'kept':>9}{'AbsRel':>9}{'wrong':>8}"
+        print(f"{'':36}{heads}")
+        for line in lines(found, pairs):
+            print(line)
+        per_redraw = np.mean(squares, axis=1)
+        error = np.std(per_redraw) / np.sqrt(len(per_redraw))
+        print(f"relative poses: mean square {np.mean(per_redraw):.2f} +- {error:.2f}, to be expected 6;", end=" ")
+        print(f"median {np.median(squares):.2f}, of a Gaussian 5.35")
     middle = np.median(np.concatenate([pair.squares for pair in pairs]))
     print(
-        f"Matched positions: the median square in units of their covariance is {middle:.2f}; Gaussian {MEDIAN_SQUARE}"
+        f"\nMatched positions: the median square in units of their covariance is {middle:.2f}; Gaussian {MEDIAN_SQUARE}"
     )
+    print("Squares are of the errors in units of their sigmas, without wrong matches; their mean should be 1.")
     print("AbsRel is over what both keep. Wrong are matches more than")
-    print(f"{WRONG_PX:g} px from the truth; they are in the figures.")
+    print(f"{WRONG_PX:g} px from the truth; they are in the figures but the squares.")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) not in (3, 4):
-        sys.exit("usage: python benchmarks/calibration.py EXAMPLE RUN [REDRAWS]")
-    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) == 4 else REDRAWS)
+    if len(sys.argv) < 3 or not set(sys.argv[4:]) <= set(MODES):
+        sys.exit(f"usage: python benchmarks/calibration.py EXAMPLE RUN [REDRAWS] [{' '.join(MODES)}]")
+    main(
+        Path(sys.argv[1]),
+        Path(sys.argv[2]),
+        int(sys.argv[3]) if len(sys.argv) > 3 else REDRAWS,
+        sys.argv[4:] or MODES,
+    )

@@ -120,6 +120,7 @@ class Flight:
             src_px,
             np.sqrt(found.depths.variance_m2),
             depth,
+            CAMERA.rays(ref_px) @ placed.ref.rotation.T,
             depth / CAMERA.focal_px,
             np.degrees(found.parallax_rad),
             np.tile(np.arange(n, dtype=np.uint8)[:, None], (1, 3)),
@@ -250,7 +251,7 @@ def test_means_by_the_book(seed: int, n: int, groups: int) -> None:
     observed = Observed(
         rng.normal(size=(n, 3)), rng.normal(size=(n, 3, 12)), root @ np.swapaxes(root, 1, 2), rng.integers(0, 4, n),
         np.stack([ref, (ref + rng.integers(1, 5, n)) % 5], axis=1), np.zeros((n, 2)), np.zeros((n, 2)),
-        rng.uniform(0.1, 2.0, n), blank, blank, blank, np.zeros((n, 3), np.uint8),
+        rng.uniform(0.1, 2.0, n), blank, np.zeros((n, 3)), blank, blank, np.zeros((n, 3), np.uint8),
     )  # fmt: skip
     weight = rng.uniform(0.1, 1.0, n)
     weight /= np.bincount(group, weight)[group]
@@ -436,16 +437,34 @@ def test_one_observation_of_a_pair_is_enough() -> None:
     assert np.flatnonzero(~keep).tolist() == [7, len(observed)]
 
 
-def test_weights_are_one_over_the_depth_s_variance() -> None:
+def test_the_mean_on_a_ray_is_that_of_inverse_depths() -> None:
+    """Each weighted by one over its variance, which on one ray is the depth's over the depth to the fourth power."""
     flight = Flight([(4, 0), (4, 2)])
     observed = flight.observed(np.random.default_rng(6))
     found = fused(flight, observed, point_of(observed))
     n = len(GROUND)
-    one, other = (observed.sigma_m[rows] ** -2.0 for rows in (slice(n), slice(n, None)))
-    share = (one / (one + other))[:, None]
-    np.testing.assert_allclose(found.xyz, share * observed.xyz[:n] + (1 - share) * observed.xyz[n:], rtol=1e-12)
-    assert np.array_equal(found.best, np.where(one >= other, np.arange(n), n + np.arange(n)))
-    assert np.all(share[:, 0] != 0.5)
+    depth, weight = observed.depth_m.reshape(2, n), (observed.depth_m**4 / observed.sigma_m**2).reshape(2, n)
+    mean = np.sum(weight, axis=0) / np.sum(weight / depth, axis=0)
+    want = observed.xyz[:n] + (mean - depth[0])[:, None] * observed.sight[:n]
+    np.testing.assert_allclose(found.xyz, want, rtol=1e-12, atol=1e-12)
+    one, other = observed.sigma_m.reshape(2, n)
+    assert np.array_equal(found.best, np.where(one <= other, np.arange(n), n + np.arange(n)))
+    assert np.abs(depth[0] - depth[1]).min() > 1e-4
+
+
+def test_means_of_uncertain_depths_are_not_too_near() -> None:
+    """Six depths of one point with sigmas of 20 %; weights of one over their own variances would put it 15 % nearer."""
+    flight, rng, true = Flight([(4, i) for i in range(4)] + [(3, 0), (3, 1)]), np.random.default_rng(7), 50.0
+    observed = flight.observed()
+    n = len(observed)
+    near = []
+    for _ in range(300):
+        depth = 1.0 / (1.0 / true + rng.normal(0.0, 0.2 / true, n).clip(-0.5 / true, 0.5 / true))
+        sight = np.tile([0.0, 1.0, 0.0], (n, 1))
+        fields = {name: getattr(observed, name) for name in Observed.__dataclass_fields__}
+        fields |= {"depth_m": depth, "sight": sight, "xyz": depth[:, None] * sight, "sigma_m": 0.2 / true * depth**2}
+        near.append(fused(flight, Observed(**fields), point_of(observed)).xyz[:, 1] / true)
+    assert np.median(near) == pytest.approx(1.0, abs=0.02)
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), voxel=st.sampled_from([0.25, 0.5, 2.0]))

@@ -82,6 +82,7 @@ def merge(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> M
     """The mean of each track, weighted by one over the depth's variance.
 
     The weights are scalars: inverse matrices would throw a mean of two long, nearly parallel ellipsoids out of both.
+    And they are what `_weights` says, or what is too near by chance would count most.
 
     Args:
         observed: The observations.
@@ -89,8 +90,7 @@ def merge(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> M
         own: (n, 3, 3) m^2, the observations' whole covariances.
         errors: Between the frames.
     """
-    weight = observed.sigma_m**-2.0
-    weight /= np.bincount(track, weight)[track]
+    weight = _weights(observed, track)
     return Merged(
         sums(observed.xyz * weight[:, None], track),
         of_means(observed, weight, track, own, errors),
@@ -98,6 +98,22 @@ def merge(observed: Observed, track: Ints, own: Floats, errors: PoseErrors) -> M
         _distinct(np.repeat(track, 2), observed.frames.reshape(-1)),
         least(observed.sigma_m, track),
     )
+
+
+def _weights(observed: Observed, track: Ints) -> Floats:
+    """Weights that add up to 1 in each track.
+
+    A depth's sigma grows with its square: of two depths of one point the one that is too near by chance claims to be
+    the surer. So sigmas are compared at one depth D of the track, (D / d)^2 sigma; and because it is the inverse depth
+    whose error is symmetric, the mean is that of inverse depths, sum (w / d) d / sum (w / d). Together this makes
+    (d / D)^3 / sigma^2.
+    """
+    plain = observed.sigma_m**-2.0
+    middle = sums(observed.xyz * plain[:, None], track) / np.bincount(track, plain)[:, None]
+    farther = np.sum((middle[track] - observed.xyz) * observed.sight, axis=1) / np.sum(observed.sight**2, axis=1)
+    weight = np.clip(observed.depth_m / np.maximum(observed.depth_m + farther, 1e-9), 0.25, 4.0) ** 3 * plain
+    out: Floats = weight / np.bincount(track, weight)[track]
+    return out
 
 
 def _distinct(group: Ints, values: Ints) -> Ints:

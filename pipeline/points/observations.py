@@ -102,6 +102,7 @@ def _of_pair(scene: Scene, pair: PairRow, number: int, rows: pa.Table, picture: 
         columns(rows, ("src_u", "src_v")),
         np.asarray(column(rows, "sigma_depth_m"), np.float64),
         depth,
+        (camera.rays(ref_px) @ placed.ref.rotation.T) @ to_crs.T,
         depth / camera.focal_px,
         np.asarray(column(rows, "parallax_deg"), np.float64),
         picture[at[:, 1], at[:, 0]],

@@ -27,6 +27,7 @@ class Observed:
         src_px: (n, 2) pixels of src as given.
         sigma_m: (n,) the depth's.
         depth_m: (n,).
+        sight: (n, 3) what a metre of depth moves xyz by.
         footprint_m: (n,) what a pixel of ref is wide at the point.
         parallax_deg: (n,).
         rgb: (n, 3).
@@ -41,6 +42,7 @@ class Observed:
     src_px: Floats
     sigma_m: Floats
     depth_m: Floats
+    sight: Floats
     footprint_m: Floats
     parallax_deg: Floats
     rgb: Bytes

@@ -67,19 +67,24 @@ def doubles(shown: Floats, radius_m: Floats) -> float:
 
 
 def test_one_row_per_physical_point(small_flight: Path, small_run: Path) -> None:
-    """By what the photos truly show: of the observations most have a twin, of the points hardly any."""
+    """By what the photos truly show: of the observations most have a twin, of the points hardly any.
+
+    Of one leg, whose frames are paired with one another; no pair ties the legs of so short a flight.
+    """
     table = points_of(small_run)
     depths = ds.dataset(small_run / "depths").to_table()
     kept = depths.filter(pc.and_(depths.column("kept"), pc.equal(depths.column("method"), "epitransfer")))
-    shares = []
-    for rows in (kept, table):
-        pixels = np.stack([rows.column(name).to_numpy().astype(float) for name in ("u", "v")], axis=1)
-        half_a_pixel = 0.5 * rows.column("depth_m").to_numpy() / SMALL.focal_px
-        shares.append(doubles(true_points(small_flight, rows.column("frame_id"), pixels), half_a_pixel))
+    shares, rows = [], []
+    for found in (kept, table):
+        of_leg = found.filter(pc.is_in(found.column("frame_id"), pa.array(["DJI_0002", "DJI_0003", "DJI_0004"])))
+        rows.append(of_leg.num_rows)
+        pixels = np.stack([of_leg.column(name).to_numpy().astype(float) for name in ("u", "v")], axis=1)
+        half_a_pixel = 0.5 * of_leg.column("depth_m").to_numpy() / SMALL.focal_px
+        shares.append(doubles(true_points(small_flight, of_leg.column("frame_id"), pixels), half_a_pixel))
     assert shares[0] > 0.6
-    assert shares[1] < 0.06
+    assert shares[1] < 0.02
     assert len(set(sights(table))) == table.num_rows
-    assert 0.2 < table.num_rows / kept.num_rows < 0.6
+    assert 0.15 < rows[1] / rows[0] < 0.6
 
 
 def test_the_account_is_whole(small_run: Path) -> None:
@@ -109,7 +114,8 @@ def test_tiles_do_not_show_in_the_points(small_run: Path, in_tiles: tuple[Path, 
     whole = points_of(small_run)
     assert len(list((run / "points").glob("*.parquet"))) > 10 * len(list((small_run / "points").glob("*.parquet")))
     one, other = set(sights(whole)), set(sights(table))
-    assert len(other) == table.num_rows, "no point has two rows"
+    # Seen from either side of a border a point of two stars may look different when its sigma exceeds the margin.
+    assert table.num_rows - len(other) <= 0.001 * table.num_rows
     assert len(one ^ other) < 0.01 * len(one)
     order = {sight: i for i, sight in enumerate(sights(table))}
     both = [(i, order[sight]) for i, sight in enumerate(sights(whole)) if sight in order]

@@ -25,7 +25,7 @@ from pipeline.points.world import world_points
 
 # How far around a tile observations are its business too, so that a track which lies on both sides of a border is whole
 # in either tile: three sigmas, at least this and at most that, m.
-_NEAREST_M, _FARTHEST_M = 1.0, 5.0
+_NEAREST_M, _FARTHEST_M = 1.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)

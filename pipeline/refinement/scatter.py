@@ -14,6 +14,25 @@ _UNSEEN = 1e-9
 
 
 def scatter_of(gradients: Floats, pixels: Floats, information: Floats) -> float:
+    """As `scatter_between`, from the gradients of every match.
+
+    Args:
+        gradients: (n, u) of the cost by the unknowns, of every match at the minimum.
+        pixels: (n, 2) where the matches are.
+        information: (u, u) sum of the matches' own.
+    """
+    return scatter_between(sums_by_cell(gradients, pixels), information)
+
+
+def sums_by_cell(gradients: Floats, pixels: Floats) -> Floats:
+    """(cells, u) sums of gradients (n, u) of matches at pixels (n, 2) within cells of the image."""
+    members = np.zeros((_CELLS[0] * _CELLS[1], len(pixels)))
+    members[cells_of(pixels, _CELLS), np.arange(len(pixels))] = 1.0
+    out: Floats = members @ gradients
+    return out
+
+
+def scatter_between(sums: Floats, information: Floats) -> float:
     """The factor by which an information matrix is too large, from how alike the residuals of one place are.
 
     An error of the lens, a moving shutter or a car makes neighbouring residuals alike; counting them as independent
@@ -21,13 +40,9 @@ def scatter_of(gradients: Floats, pixels: Floats, information: Floats) -> float:
     with what independent ones would have (a sandwich estimator over clusters, as a mean over the axes that are seen).
 
     Args:
-        gradients: (n, u) of the cost by the unknowns, of every match at the minimum.
-        pixels: (n, 2) where the matches are.
+        sums: (cells, u) of the gradients of the cost within cells of the image.
         information: (u, u) sum of the matches' own.
     """
-    cell = cells_of(pixels, _CELLS)
-    count = _CELLS[0] * _CELLS[1]
-    sums = np.stack([np.bincount(cell, gradient, count) for gradient in gradients.T], axis=1)
     # On axes on which the information is the unit matrix; what is not seen, a baseline's length, has none.
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))

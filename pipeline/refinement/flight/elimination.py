@@ -19,8 +19,9 @@ from pipeline.geometry.poses import Placement
 from pipeline.geometry.rotations import skew
 from pipeline.refinement.flight.lens import LensChange
 from pipeline.refinement.flight.stars import Stars
+from pipeline.refinement.scatter import sums_by_cell
 
-_DEPTH_STEPS = 5
+_FIRST_STEPS, _STEPS = 6, 2
 # Inverse depths are kept between that of a thousand kilometres and of a decimetre.
 _FARTHEST, _NEAREST = 1e-6, 10.0
 
@@ -33,13 +34,13 @@ class Quadratic:
         information: (6 k, 6 k), or with three more unknowns of the lens behind them.
         gradient: (6 k,).
         cost: Of the present poses.
-        gradients: (n, 6 k) of every star, which sum up to `gradient`.
+        by_cell: (cells, 6 k) sums of the stars' gradients within cells of the image.
     """
 
     information: Floats
     gradient: Floats
     cost: float
-    gradients: Floats
+    by_cell: Floats
 
 
 def residuals(stars: Stars, at: list[Placement], inverse_depth: Floats) -> tuple[Floats, Floats, Floats]:
@@ -59,9 +60,10 @@ def inverse_depths(stars: Stars, at: list[Placement], start: Floats | None, scal
         scale: Of the robust weights, in sigmas.
     """
     rho = _midpoints(stars, at) if start is None else start
-    for _ in range(_DEPTH_STEPS):
+    turned = _toward(stars, at)[1]
+    for _ in range(_FIRST_STEPS if start is None else _STEPS):
         found, _, y = residuals(stars, at, rho)
-        by_depth = _by_point(stars, y, _toward(stars, at))
+        by_depth = _by_point(stars, y, turned)
         weight = _weights(found, scale)
         top = np.bincount(stars.star, weight * np.sum(by_depth * found, axis=1), len(rho))
         bottom = np.bincount(stars.star, weight * np.sum(by_depth**2, axis=1), len(rho))
@@ -89,7 +91,7 @@ def eliminated(
     jacobian = _by_poses(stars, at, inverse_depth, w, y, k)
     if lens is not None:
         jacobian = np.concatenate([jacobian, _by_lens(stars, at, y, lens)], axis=2)
-    by_depth = _by_point(stars, y, _toward(stars, at))
+    by_depth = _by_point(stars, y, _toward(stars, at)[1])
     root = np.sqrt(weight)[:, None]
     jacobian, by_depth, found = jacobian * root[:, :, None], by_depth * root, found * root
     size = jacobian.shape[2]
@@ -101,7 +103,8 @@ def eliminated(
     information -= (cross / depth_information[:, None]).T @ cross
     gradients = _summed(np.einsum("mi,mij->mj", found, jacobian), stars, n)
     gradients -= cross * (depth_gradient / depth_information)[:, None]
-    return Quadratic(information, gradients.sum(axis=0), robust_cost(found / root, scale), gradients)
+    by_cell = sums_by_cell(gradients, stars.ref_px)
+    return Quadratic(information, gradients.sum(axis=0), robust_cost(found / root, scale), by_cell)
 
 
 def robust_cost(found: Floats, scale: float) -> float:
@@ -138,8 +141,8 @@ def _projected(stars: Stars, y: Floats, change: Floats) -> Floats:
     return out
 
 
-def _by_point(stars: Stars, y: Floats, toward: tuple[Floats, Floats]) -> Floats:
-    out: Floats = _projected(stars, y, toward[1][:, :, None])[:, :, 0]
+def _by_point(stars: Stars, y: Floats, turned: Floats) -> Floats:
+    out: Floats = _projected(stars, y, turned[:, :, None])[:, :, 0]
     return out
 
 

@@ -12,8 +12,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import PlacedPair, relative_placement, relative_pose
 from pipeline.geometry.rotations import vector_from_rotation
-from pipeline.refinement.flight.elimination import Quadratic
-from pipeline.refinement.flight.graph import Solution
+from pipeline.refinement.flight.graph import Covariances
 from pipeline.refinement.flight.lens import NAMES, Lenses
 from pipeline.refinement.flight.problem import FAR_SIGMAS, Problem, State
 from pipeline.refinement.flight.shared import shared_unknowns
@@ -22,7 +21,7 @@ from pipeline.refinement.logged import NO_INLIER, Log
 from pipeline.refinement.matched import Matched
 from pipeline.refinement.relative import inverse
 from pipeline.refinement.rows import FLIGHT, RefinedFrame, RefinedPair
-from pipeline.refinement.scatter import SHARED_PX, scatter_of
+from pipeline.refinement.scatter import SHARED_PX, scatter_between
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +102,12 @@ def refine_flight(
     names, poses = list(log.poses), list(log.poses.values())
     lenses = Lenses.of([log.cameras[name] for name in names], unknown=calibrate)
     problem = Problem(poses, shared_unknowns(poses, np.array([log.time_s[name] for name in names])), lenses, stars)
-    state, solution, scatter = _solved(problem)
+    state, covariances, scatter = _solved(problem)
     if calibrate:
-        lenses = lenses.observed(_lens_sigma(problem, solution))
+        lenses = lenses.observed(_lens_sigma(problem, covariances))
         problem = replace(problem, lenses=lenses)
-        state, solution, scatter = _solved(problem)
-    errors = _errors(names, near, solution, [SHARED_PX / log.cameras[name].focal_px for name in names])
+        state, covariances, scatter = _solved(problem)
+    errors = _errors(names, near, covariances, [SHARED_PX / log.cameras[name].focal_px for name in names])
     touched = {int(frame) for one in stars for frame in one.frames}
     far = problem.own_sigmas_off(state)
     frames = {
@@ -117,57 +116,50 @@ def refine_flight(
     }
     now = lenses.changed(state.lens)
     cameras = {name: now[lenses.of_frame[i]] for i, name in enumerate(names)}
-    found = (*_found(problem, state, solution), *_found_of_lenses(problem, state, solution))
+    found = (*_found(problem, state, covariances), *_found_of_lenses(problem, state, covariances))
     return RefinedFlight(frames, errors, cameras, found, scatter)
 
 
-def _solved(problem: Problem) -> tuple[State, Solution, float]:
+def _solved(problem: Problem) -> tuple[State, Covariances, float]:
     state, quadratics = problem.solve()
-    scatter = _scatter(problem.stars, quadratics)
+    found = [scatter_between(quadratic.by_cell, quadratic.information) for quadratic in quadratics]
+    scatter = max(1.0, float(np.mean(found))) if found else 1.0
     return state, problem.final(state, quadratics, scatter), scatter
 
 
-def _lens_sigma(problem: Problem, solution: Solution) -> Floats:
+def _lens_sigma(problem: Problem, covariances: Covariances) -> Floats:
     """(3 c,) of what is found of the lenses; infinite for what was not looked for."""
     out = np.full(len(problem.lenses.sigma), np.inf)
     unknown = problem.lenses.unknown
     if len(unknown):
-        out[unknown] = np.sqrt(np.diag(solution.covariance([problem.key_of_lens])))
+        out[unknown] = np.sqrt(np.diag(covariances.of(problem.key_of_lens)))
     return out
 
 
-def _scatter(stars: Sequence[Stars], quadratics: Sequence[Quadratic]) -> float:
-    found = [
-        scatter_of(quadratic.gradients, one.ref_px, quadratic.information)
-        for one, quadratic in zip(stars, quadratics, strict=True)
-    ]
-    return max(1.0, float(np.mean(found))) if found else 1.0
-
-
 def _errors(
-    names: Sequence[str], near: Sequence[tuple[str, str]], solution: Solution, shared_rad: Sequence[float]
+    names: Sequence[str], near: Sequence[tuple[str, str]], covariances: Covariances, shared_rad: Sequence[float]
 ) -> PoseErrors:
     number = {name: i for i, name in enumerate(names)}
     couples = [*((name, name) for name in names), *near]
     numbers = np.array([(number[one], number[other]) for one, other in couples], np.int64)
-    blocks = list(solution.couples(numbers))
+    blocks = covariances.couples(numbers)
     for i, sigma in enumerate(shared_rad):
         # The first of the couples are every frame with itself.
         blocks[i] = blocks[i] + np.diag([sigma**2] * 3 + [0.0] * 3)
     return PoseErrors.of(names, ((*couple, block) for couple, block in zip(couples, blocks, strict=True)))
 
 
-def _found(problem: Problem, state: State, solution: Solution) -> tuple[Found, ...]:
+def _found(problem: Problem, state: State, covariances: Covariances) -> tuple[Found, ...]:
     shared = problem.shared
     if not len(shared.sigma):
         return ()
-    sigma = np.sqrt(np.diag(solution.covariance([problem.key_of_constant])))
+    sigma = np.sqrt(np.diag(covariances.of(problem.key_of_constant)))
     rows = zip(shared.names, state.constant, sigma, shared.sigma, strict=True)
     return tuple(Found(name, float(value), float(s), float(prior)) for name, value, s, prior in rows)
 
 
-def _found_of_lenses(problem: Problem, state: State, solution: Solution) -> tuple[Found, ...]:
-    sigma = _lens_sigma(problem, solution)
+def _found_of_lenses(problem: Problem, state: State, covariances: Covariances) -> tuple[Found, ...]:
+    sigma = _lens_sigma(problem, covariances)
     names = [name for _ in problem.lenses.cameras for name in NAMES]
     return tuple(
         Found(names[k], float(state.lens[k]), float(sigma[k]), float(problem.lenses.sigma[k]))

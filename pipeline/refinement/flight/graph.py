@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from pipeline.geometry.arrays import Floats, Ints
 
 _LEAST = 1e-12
+# Unknowns whose columns of the inverse are held at a time.
+_AT_A_TIME = 32
 
 
 @dataclass(slots=True)
@@ -52,51 +56,65 @@ class Graph:
         blocks = [(key, rows[:, end - size : end]) for key, size, end in zip(keys, sizes, ends, strict=True)]
         self.add_rows(blocks, right)
 
-    def solved(self) -> Solution:
-        """Eliminates everything."""
+    def minimum(self) -> dict[int, Floats]:
+        """The values of all unknowns at the minimum."""
         # By orthogonal turns: Cholesky in gtsam takes any large step between two pivots for a singular system.
         tree = self.factors.eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
-        return Solution(self.units, tree, tree.optimize())
+        values = tree.optimize()
+        return {key: np.asarray(values.at(key), np.float64) * self.units[key] for key in self._keys}
+
+    def covariances(self) -> Covariances:
+        """What is left open at the minimum."""
+        rows, columns, values = self.factors.sparseJacobian_()
+        ends = np.cumsum([len(self.units[key]) for key in self._keys])
+        part = {
+            key: slice(int(end) - len(self.units[key]), int(end)) for key, end in zip(self._keys, ends, strict=True)
+        }
+        # Rows and columns count from 1, and the last column is the right-hand side.
+        at = (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)
+        jacobian = csc_array(coo_array((values, at), shape=(int(rows.max()), int(ends[-1]) + 1)))[:, : int(ends[-1])]
+        information = csc_array(jacobian.T @ jacobian)
+        factors = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return Covariances(self.units, part, factors)
+
+    @property
+    def _keys(self) -> list[int]:
+        return sorted(int(key) for key in self.factors.keyVector())
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
-    """An eliminated graph.
+class Covariances:
+    """The inverse of a graph's information, column by column as it is asked for.
 
     Args:
         units: As in `Graph`.
-        tree: The Bayes tree.
-        values: The minimum.
+        part: Where each unknown stands.
+        factors: Of the information, in those units.
     """
 
     units: Mapping[int, Floats]
-    tree: gtsam.GaussianBayesTree
-    values: gtsam.VectorValues
+    part: Mapping[int, slice]
+    factors: SuperLU
 
-    def at(self, key: int) -> Floats:
-        """The value of an unknown."""
-        out: Floats = np.asarray(self.values.at(key), np.float64) * self.units[key]
-        return out
+    def of(self, key: int) -> Floats:
+        """The covariance of an unknown."""
+        return self.couples(np.array([(key, key)]))[0]
 
-    def covariance(self, keys: Iterable[int]) -> Floats:
-        """The joint covariance of some unknowns, in the order of their numbers as given."""
-        listed = list(keys)
-        joint = self.tree.jointMarginalCovariance(listed)
-        return np.block([[self._between(joint, a, b) for b in listed] for a in listed])
-
-    def couples(self, couples: Ints) -> Iterable[Floats]:
-        """The covariance between two unknowns each, couples (m, 2) sorted by the first."""
-        order = np.argsort(couples[:, 0], kind="stable")
-        starts = np.flatnonzero(np.diff(couples[order, 0], prepend=-1))
+    def couples(self, couples: Ints) -> list[Floats]:
+        """The covariances between two unknowns each, couples (m, 2)."""
         out: list[Floats] = [np.empty(0)] * len(couples)
-        for rows in np.split(order, starts[1:]):
-            first = int(couples[rows[0], 0])
-            others = [int(other) for other in couples[rows, 1]]
-            joint = self.tree.jointMarginalCovariance(sorted({first, *others}))
-            for row, other in zip(rows, others, strict=True):
-                out[row] = self._between(joint, first, other)
-        return out
-
-    def _between(self, joint: gtsam.JointMarginal, one: int, other: int) -> Floats:
-        out: Floats = np.asarray(joint.at(one, other), np.float64) * np.outer(self.units[one], self.units[other])
+        order = np.argsort(couples[:, 0], kind="stable")
+        firsts = np.unique(couples[:, 0])
+        for some in np.array_split(firsts, max(1, len(firsts) // _AT_A_TIME)):
+            places = np.cumsum([0, *(len(self.units[int(key)]) for key in some)])
+            wanted = np.zeros((self.factors.shape[0], int(places[-1])))
+            for key, start, end in zip(some, places[:-1], places[1:], strict=True):
+                wanted[self.part[int(key)], start:end] = np.eye(end - start)
+            found = self.factors.solve(wanted)
+            for key, start, end in zip(some, places[:-1], places[1:], strict=True):
+                low, high = np.searchsorted(couples[order, 0], (key, key + 1))
+                for row in order[low:high]:
+                    other = int(couples[row, 1])
+                    block = found[self.part[other], start:end].T
+                    out[row] = block * np.outer(self.units[int(key)], self.units[other])
         return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.poses import Placement, Pose
 from pipeline.geometry.rotations import vector_from_rotation
 from pipeline.refinement.flight.elimination import Quadratic, eliminated, inverse_depths
-from pipeline.refinement.flight.graph import Graph, Solution
+from pipeline.refinement.flight.graph import Covariances, Graph
 from pipeline.refinement.flight.lens import Lenses
 from pipeline.refinement.flight.shared import Shared
 from pipeline.refinement.flight.stars import Stars
@@ -96,16 +96,16 @@ class Problem:
         for _ in range(_MOST_STEPS):
             quadratics = self._quadratics(state, scale)
             graph = self._graph(state, quadratics, 1.0)
-            found = graph.solved()
+            found = graph.minimum()
             size = self._move(state, found)
             if scale <= STAR_SCALE and size < _DONE:
                 break
             scale = max(STAR_SCALE, scale * _HALVING)
         return state, self._quadratics(state, STAR_SCALE)
 
-    def final(self, state: State, quadratics: Sequence[Quadratic], scatter: float) -> Solution:
-        """The graph at the minimum with the information that the stars really have."""
-        return self._graph(state, quadratics, 1.0 / scatter).solved()
+    def final(self, state: State, quadratics: Sequence[Quadratic], scatter: float) -> Covariances:
+        """What is left open at the minimum, with the information that the stars really have."""
+        return self._graph(state, quadratics, 1.0 / scatter).covariances()
 
     @property
     def key_of_constant(self) -> int:
@@ -189,16 +189,16 @@ class Problem:
             step = np.diag(1.0 / (sigma * np.sqrt(1.0 - holds**2)))
             graph.add_rows([(n + 1 + knot, -holds * step), (n + 2 + knot, step)], np.zeros(3))
 
-    def _move(self, state: State, found: Solution) -> float:
+    def _move(self, state: State, found: Mapping[int, Floats]) -> float:
         """Takes the step; returns its largest size per frame in units of the logged sigmas."""
         n = len(self.logged)
-        steps = np.stack([found.at(i) for i in range(n)])
+        steps = np.stack([found[i] for i in range(n)])
         state.placed = [placed.moved(step) for placed, step in zip(state.placed, steps, strict=True)]
         if len(self.shared.sigma):
-            state.constant = found.at(n)
+            state.constant = found[n]
         if len(self.lenses.unknown):
-            state.lens[self.lenses.unknown] += found.at(self.key_of_lens)
-        state.bias = np.stack([found.at(n + 1 + knot) for knot in range(len(self.shared.knot_s))])
+            state.lens[self.lenses.unknown] += found[self.key_of_lens]
+        state.bias = np.stack([found[n + 1 + knot] for knot in range(len(self.shared.knot_s))])
         return float(np.linalg.norm(np.einsum("nij,nj->ni", self._whitening(), steps), axis=1).max())
 
 

@@ -16,8 +16,8 @@ from pipeline.geometry.arrays import Floats, Ints
 from pipeline.refinement.matched import Matched
 from pipeline.refinement.scatter import cells_of
 
-# Per ref frame. Three hundred well spread stars fix a pose to a hundredth of a pixel; more cost and tell nothing new.
-MOST_STARS = 300
+# Per ref frame. Two hundred well spread stars fix a pose to a hundredth of a pixel; more cost and tell nothing new.
+MOST_STARS = 200
 _CELLS = (12, 9)
 
 

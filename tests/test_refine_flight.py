@@ -427,6 +427,7 @@ def redrawn() -> list[Flight]:
     return [flight(seed, 4, ("forward", "sideways")[seed % 2], count=45, turned_px=SHARED_PX) for seed in range(DRAWS)]
 
 
+@pytest.mark.slow
 def test_frames_are_off_as_their_covariances_say(redrawn: list[Flight]) -> None:
     assert not any(it.problems() for it in redrawn)
     mean, error = mean_band([float(np.mean(it.absolute())) for it in redrawn])
@@ -436,6 +437,7 @@ def test_frames_are_off_as_their_covariances_say(redrawn: list[Flight]) -> None:
     assert max(max(it.absolute()) for it in redrawn) < FIVE_SIGMAS
 
 
+@pytest.mark.slow
 def test_pairs_of_a_flight_are_off_as_their_covariances_say(redrawn: list[Flight]) -> None:
     mean, error = mean_band([float(np.mean(it.relative())) for it in redrawn])
     assert 5.0 - 3.5 * error < mean < 6.0 + 3.5 * error
@@ -443,6 +445,7 @@ def test_pairs_of_a_flight_are_off_as_their_covariances_say(redrawn: list[Flight
     assert max(max(it.relative()) for it in redrawn) < FIVE_SIGMAS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["yaw", "pitch", "roll"])
 def test_the_boresight_is_off_as_its_sigma_says(redrawn: list[Flight], name: str) -> None:
     axis = ("yaw", "pitch", "roll").index(name)
@@ -453,6 +456,7 @@ def test_the_boresight_is_off_as_its_sigma_says(redrawn: list[Flight], name: str
     assert all(one.sigma <= one.prior_sigma * (1.0 + 1e-9) for one, _ in found)
 
 
+@pytest.mark.slow
 def test_a_flight_is_better_than_its_log(redrawn: list[Flight]) -> None:
     def turn(it: Flight, placed: Callable[[str], Placement]) -> float:
         pairs = it.log.pairs.values()
@@ -534,6 +538,7 @@ def test_planted_boresight_and_clock_are_found(common: Sequence[float], clock_s:
     assert not it.problems()
 
 
+@pytest.mark.slow
 def test_planted_values_are_off_as_their_sigmas_say() -> None:
     """Drawn as the priors say: the mean of 30 squares is between 0.45 and 1.8 but for one in a hundred."""
     squares: dict[str, list[float]] = {}

@@ -304,6 +304,7 @@ def mean_band(unknowns: int, draws: int = DRAWS) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_relative_poses_are_off_as_their_covariances_say(way: str) -> None:
     found = redrawn(way)
@@ -316,6 +317,7 @@ def test_relative_poses_are_off_as_their_covariances_say(way: str) -> None:
     assert max(values) < FIVE_SIGMAS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_both_cameras_are_off_as_their_joint_covariance_says(way: str) -> None:
     values = [nees(both_off(it, pair.placed.ref, pair.placed.src), pair.covariance) for it, pair in redrawn(way)]
@@ -324,6 +326,7 @@ def test_both_cameras_are_off_as_their_joint_covariance_says(way: str) -> None:
     assert 0.90 < np.mean(np.array(values) < chi2.ppf(0.95, 12)) < 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_without_the_turn_that_no_match_shows_sigmas_are_somewhat_too_large(way: str) -> None:
     scenes = [scene(seed, way) for seed in range(60)]
@@ -331,6 +334,7 @@ def test_without_the_turn_that_no_match_shows_sigmas_are_somewhat_too_large(way:
     assert 3.2 < np.mean(values) < 5.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_gain_and_noise_make_up_what_is_left_of_the_log_s_error(way: str) -> None:
     """What a pair's errors are made of: gain times the log's own error, and an error of the pair alone."""
@@ -351,6 +355,7 @@ def test_gain_and_noise_make_up_what_is_left_of_the_log_s_error(way: str) -> Non
     assert 0.75 < found / expected < 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "logged_band", "refined_band"),
     [("forward", (0.05, 0.2), (0.006, 0.02)), ("sideways", (0.04, 0.2), (0.006, 0.02))],
@@ -660,7 +665,7 @@ def test_a_log_that_is_off_by_twenty_sigmas_is_told_and_mended(way: str) -> None
         assert wider > 1.0
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, derandomize=True)
 @given(seed=st.integers(0, 10_000), yaw_deg=st.floats(0.0, 360.0), pitch_deg=st.floats(-90.0, -10.0))
 def test_any_flight_s_pair_is_refined_or_refused_for_a_reason(seed: int, yaw_deg: float, pitch_deg: float) -> None:
     rng = np.random.default_rng(seed)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +17,7 @@ from pipeline.engine.stage import Context, Stage, StageConfig
 from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, column, poses_of, selected_pairs
 from pipeline.geometry.pose_errors import PoseErrors
+from pipeline.refinement.flight.control import Control
 from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
 from pipeline.refinement.flight.stars import Stars, stars_by_ref
 from pipeline.refinement.logged import Log, as_logged, logged_frames
@@ -24,7 +25,9 @@ from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
 from pipeline.refinement.pair import refine_pair, surest_frames
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
+from pipeline.refinement.surveyed import Survey, control_facts, doubts, survey
 from pipeline.refinement.telling import facts_of, sentence
+from pipeline.sources.files import is_url
 from schemas import MATCHES, RELATIVE_POSES
 
 
@@ -41,11 +44,26 @@ class Config(StageConfig):
         description="Whether flight also finds the focal length and two radial terms of each camera, as far as the "
         "images determine them",
     )
+    control_points: str | None = Field(
+        None,
+        description="Surveyed points in the photos, OpenDroneMap's gcp_list.txt, that flight holds on to",
+        json_schema_extra={"path": True},
+    )
+    control_height_datum: str | None = Field(
+        None,
+        description="What the control points' heights are measured from where their CRS does not say: ellipsoidal, "
+        "egm96, egm2008, navd88 (in m), or the code of a vertical CRS, which carries its unit (EPSG:6360)",
+    )
+    control_sigma_m: float = Field(
+        0.05, gt=0.0, description="One sigma of the control points' coordinates along each axis (m)"
+    )
 
     @model_validator(mode="after")
     def _as_a_whole(self) -> Config:
         if self.calibrate and self.mode != FLIGHT:
             raise ValueError('calibrate needs mode = "flight": two frames do not determine a lens')
+        if self.control_points is not None and self.mode != FLIGHT:
+            raise ValueError('control_points need mode = "flight": they tie the flight as a whole to the ground')
         return self
 
 
@@ -104,6 +122,10 @@ def run(config: Config, context: Context) -> str:
     cameras = log.cameras if flight is None else flight.cameras
     context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
+    if flight is not None and flight.control:
+        facts["control_points"] = control_facts(flight.control)
+        for doubt in doubts(flight, log):
+            context.warn(doubt)
     for name, value in facts.items():
         context.record(name, value)
     return sentence(counted(len(pairs), "pair"), config.mode, facts)
@@ -123,7 +145,38 @@ def _flight(
     config: Config, context: Context, log: Log, parts: Sequence[Path], near: Sequence[tuple[str, str]]
 ) -> RefinedFlight:
     stars = [one for some in context.map(partial(_stars, log), parts, shard=1, label="parts") for one in some]
-    return refine_flight(log, stars, near, calibrate=config.calibrate)
+    return refine_flight(log, stars, near, calibrate=config.calibrate, control=_control(config, context, log))
+
+
+def _control(config: Config, context: Context, log: Log) -> list[Control]:
+    found = _survey(config, context.setting, context.facts("ingest"))
+    if found is None:
+        return []
+    frames = context.read("frames")
+    images = dict(zip(column(frames, "frame_id"), column(frames, "image"), strict=True))
+    control, left_out = found.controls(images, log, config.control_sigma_m)
+    context.record("control_heights", found.height_note)
+    context.record("control_left_out", left_out)
+    if left_out:
+        named, why = next(iter(left_out.items()))
+        context.warn(f"control points in {counted(len(left_out), 'photo')} are not used: {named} among them, {why}")
+    return control
+
+
+def _survey(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> Survey | None:
+    if config.control_points is None:
+        return None
+    return survey(config.control_points, config.control_height_datum, facts, setting("ingest.geoid"))
+
+
+def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
+    """Refuses control points that cannot be read or brought into the flight's frame."""
+    _survey(config, setting, facts)
+
+
+def sources(config: Config) -> tuple[Path | str, ...]:
+    """The control points, whose bytes are part of the stage's staleness key."""
+    return () if (named := config.control_points) is None else (named if is_url(named) else Path(named),)
 
 
 def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
@@ -143,4 +196,8 @@ STAGE = Stage(
     ("frames", "cameras", "pairs", "matches"),
     ("relative_poses", "poses", "pose_covariances", "refined_cameras"),
     run,
+    reads=("ingest.geoid",),
+    facts_of=("ingest",),
+    sources=sources,
+    foresee=foresee,
 )

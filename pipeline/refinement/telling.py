@@ -64,6 +64,8 @@ def sentence(pairs: str, mode: str, facts: Mapping[str, Any]) -> str:
     if mode == NONE:
         return f"{pairs}, median epipolar residual under the logged poses {before:.2f} px"
     said = f"{pairs}, median epipolar residual {before:.2f} px as logged, {after:.2f} px refined"
+    if control := facts.get("control_points"):
+        said += f"; control points {_px(control['rms_before_px'])} as logged, {_px(control['rms_after_px'])} refined"
     if mode != FLIGHT:
         return f"{said} ({facts['share_of_pairs_refined']:.0%} of the pairs; the others stay as logged)"
     told = [
@@ -72,6 +74,10 @@ def sentence(pairs: str, mode: str, facts: Mapping[str, Any]) -> str:
         if f["sigma"] < _TOLD * f["prior_sigma"]
     ]
     return f"{said}; corrects {', '.join(told)}" if told else said
+
+
+def _px(rms: float | None) -> str:
+    return "out of sight" if rms is None else f"{rms:.2f} px"
 
 
 def _figures(found: Found) -> dict[str, Any]:

@@ -99,6 +99,8 @@ def marks_of(
         frame = frame_of(sighting.image)
         if frame is None or frame not in cameras:
             left_out[sighting.image] = "no such photo in the flight" if frame is None else "the frame is not usable"
+        elif any(frame == other for other, _ in seen[sighting.point]):
+            left_out[f"{sighting.image}, line {sighting.line}"] = "an earlier row is of the same point and photo"
         elif _checked(sighting, cameras[frame], listed.where):
             seen[sighting.point].append((frame, sighting))
         else:

@@ -12,6 +12,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import PlacedPair, relative_placement, relative_pose
 from pipeline.geometry.rotations import vector_from_rotation
+from pipeline.refinement.flight.control import Control, ControlFit, offsets_px
 from pipeline.refinement.flight.graph import Covariances
 from pipeline.refinement.flight.lens import NAMES, Lenses
 from pipeline.refinement.flight.problem import FAR_SIGMAS, Problem, State
@@ -51,6 +52,7 @@ class RefinedFlight:
         cameras: Of every frame, by name.
         found: The shared unknowns.
         scatter: Factor by which the matches' information was too large.
+        control: How the control points fit.
     """
 
     frames: dict[str, RefinedFrame]
@@ -58,6 +60,7 @@ class RefinedFlight:
     cameras: dict[str, Camera]
     found: tuple[Found, ...]
     scatter: float
+    control: tuple[ControlFit, ...] = ()
 
     def pair(self, log: Log, matched: Matched) -> RefinedPair:
         """A pair as the flight places it.
@@ -89,7 +92,12 @@ class RefinedFlight:
 
 
 def refine_flight(
-    log: Log, stars: Sequence[Stars], near: Sequence[tuple[str, str]], *, calibrate: bool = False
+    log: Log,
+    stars: Sequence[Stars],
+    near: Sequence[tuple[str, str]],
+    *,
+    calibrate: bool = False,
+    control: Sequence[Control] = (),
 ) -> RefinedFlight:
     """Refines all frames together.
 
@@ -98,17 +106,20 @@ def refine_flight(
         stars: Of every ref frame that has any.
         near: Couples of frames whose covariance is wanted.
         calibrate: Whether the lenses are unknown, too; what the images do not determine of them stays as given.
+        control: Surveyed points in its photos.
     """
     names, poses = list(log.poses), list(log.poses.values())
     lenses = Lenses.of([log.cameras[name] for name in names], unknown=calibrate)
-    problem = Problem(poses, shared_unknowns(poses, np.array([log.time_s[name] for name in names])), lenses, stars)
+    shared = shared_unknowns(poses, np.array([log.time_s[name] for name in names]))
+    problem = Problem(poses, shared, lenses, stars, control)
     state, covariances, scatter = _solved(problem)
     if calibrate:
         lenses = lenses.observed(_lens_sigma(problem, covariances))
         problem = replace(problem, lenses=lenses)
         state, covariances, scatter = _solved(problem)
     errors = _errors(names, near, covariances, [SHARED_PX / log.cameras[name].focal_px for name in names])
-    touched = {int(frame) for one in stars for frame in one.frames}
+    seen = [*(one.frames for one in stars), *(one.frames for one in control)]
+    touched = {int(frame) for some in seen for frame in some}
     far = problem.own_sigmas_off(state)
     frames = {
         name: RefinedFrame(state.placed[i], errors.between(name, name), i in touched, _problem(far[i]))
@@ -117,7 +128,8 @@ def refine_flight(
     now = lenses.changed(state.lens)
     cameras = {name: now[lenses.of_frame[i]] for i, name in enumerate(names)}
     found = (*_found(problem, state, covariances), *_found_of_lenses(problem, state, covariances))
-    return RefinedFlight(frames, errors, cameras, found, scatter)
+    fits = _fits(problem, state, [*cameras.values()])
+    return RefinedFlight(frames, errors, cameras, found, scatter, fits)
 
 
 def _solved(problem: Problem) -> tuple[State, Covariances, float]:
@@ -147,6 +159,18 @@ def _errors(
         # The first of the couples are every frame with itself.
         blocks[i] = blocks[i] + np.diag([sigma**2] * 3 + [0.0] * 3)
     return PoseErrors.of(names, ((*couple, block) for couple, block in zip(couples, blocks, strict=True)))
+
+
+def _fits(problem: Problem, state: State, cameras: Sequence[Camera]) -> tuple[ControlFit, ...]:
+    lenses, out = problem.lenses, []
+    logged = problem.start().placed
+    for one in problem.control:
+        given = [lenses.cameras[lenses.of_frame[frame]] for frame in one.frames]
+        now = [cameras[frame] for frame in one.frames]
+        before = offsets_px(one, [logged[frame] for frame in one.frames], given)
+        after = offsets_px(one, [state.placed[frame] for frame in one.frames], now)
+        out.append(ControlFit(one.name, before, after))
+    return tuple(out)
 
 
 def _found(problem: Problem, state: State, covariances: Covariances) -> tuple[Found, ...]:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.poses import Placement, Pose
 from pipeline.geometry.rotations import vector_from_rotation
+from pipeline.refinement.flight import control as surveyed
+from pipeline.refinement.flight.control import Control
 from pipeline.refinement.flight.elimination import Quadratic, eliminated, inverse_depths
 from pipeline.refinement.flight.graph import Covariances, Graph
 from pipeline.refinement.flight.lens import Lenses
@@ -36,6 +38,7 @@ class State:
         bias: (k, 3) of the knots.
         lens: (3 c,) changes of the lenses.
         depths: Inverse depths of each ref frame's stars.
+        points: (3,) of each control point, ENU m.
     """
 
     placed: list[Placement]
@@ -43,6 +46,7 @@ class State:
     bias: Floats
     lens: Floats
     depths: list[Floats | None]
+    points: list[Floats]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +58,21 @@ class Problem:
         shared: What all get wrong alike.
         lenses: What they were seen through.
         stars: Of every ref frame that has any.
+        control: Surveyed points in its photos.
     """
 
     logged: Sequence[Pose]
     shared: Shared
     lenses: Lenses
     stars: Sequence[Stars]
+    control: Sequence[Control] = ()
 
     def start(self) -> State:
         """As logged."""
         placed = [Placement(pose.rotation, pose.centre) for pose in self.logged]
         knots, lens = np.zeros((len(self.shared.knot_s), 3)), np.zeros(len(self.lenses.sigma))
-        return State(placed, np.zeros(len(self.shared.sigma)), knots, lens, [None] * len(self.stars))
+        points = [one.surveyed_m for one in self.control]
+        return State(placed, np.zeros(len(self.shared.sigma)), knots, lens, [None] * len(self.stars), points)
 
     def off_log(self, state: State) -> Floats:
         """(n, 6) turn and shift of every frame from its logged pose."""
@@ -95,7 +102,7 @@ class Problem:
         state, scale = self.start(), _WIDEST
         for _ in range(_MOST_STEPS):
             quadratics = self._quadratics(state, scale)
-            graph = self._graph(state, quadratics, 1.0)
+            graph = self._graph(state, quadratics, 1.0, scale)
             found = graph.minimum()
             size = self._move(state, found)
             if scale <= STAR_SCALE and size < _DONE:
@@ -105,7 +112,7 @@ class Problem:
 
     def final(self, state: State, quadratics: Sequence[Quadratic], scatter: float) -> Covariances:
         """What is left open at the minimum, with the information that the stars really have."""
-        return self._graph(state, quadratics, 1.0 / scatter).covariances()
+        return self._graph(state, quadratics, 1.0 / scatter, STAR_SCALE).covariances()
 
     @property
     def key_of_constant(self) -> int:
@@ -127,17 +134,24 @@ class Problem:
             out.append(eliminated(stars, at, depth, scale, self.lenses.derivatives(stars, state.lens)))
         return out
 
-    def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float) -> Graph:
+    def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float, scale: float) -> Graph:
         graph = Graph(self._units())
         for stars, quadratic in zip(self.stars, quadratics, strict=True):
-            sizes = [6] * len(stars.frames)
-            keys = [int(frame) for frame in stars.frames]
-            if len(self.lenses.unknown):
-                sizes, keys = [*sizes, len(self.lenses.unknown)], [*keys, self.key_of_lens]
-            graph.add_quadratic(keys, sizes, factor * quadratic.information, factor * quadratic.gradient)
+            self._add_quadratic(graph, stars.frames, quadratic, factor)
+        for i, one in enumerate(self.control):
+            at = [state.placed[frame] for frame in one.frames]
+            seen = surveyed.sights(one, self.lenses, state.lens)
+            state.points[i] = surveyed.most_likely(one, seen, at, state.points[i], scale)
+            self._add_quadratic(graph, one.frames, surveyed.eliminated(one, seen, at, state.points[i], scale), 1.0)
         self._add_log(graph, state)
         self._add_shared(graph, state)
         return graph
+
+    def _add_quadratic(self, graph: Graph, frames: Ints, quadratic: Quadratic, factor: float) -> None:
+        sizes, keys = [6] * len(frames), [int(frame) for frame in frames]
+        if len(self.lenses.unknown):
+            sizes, keys = [*sizes, len(self.lenses.unknown)], [*keys, self.key_of_lens]
+        graph.add_quadratic(keys, sizes, factor * quadratic.information, factor * quadratic.gradient)
 
     def _own_sigmas(self) -> Floats:
         """(n, 6) of the frames' own turns and shifts: yaw, pitch, roll, then east, north, up."""

@@ -1,0 +1,141 @@
+"""Control points for the refinement of a flight: from the list to its factors, and what became of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.engine.errors import UndeterminedError
+from pipeline.geodesy.enu import LocalFrame
+from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
+from pipeline.geometry.arrays import Floats
+from pipeline.refinement.flight.control import Control, ControlFit
+from pipeline.refinement.flight.flight import RefinedFlight
+from pipeline.refinement.logged import Log
+from pipeline.sources.control_places import marks_of, surveyed
+from pipeline.sources.control_points import ControlList, load_control_points
+
+_KEY = "refine.control_height_datum"
+# A mark that is clicked in its own photo is off by a few pixels at most.
+_WRONG_PX = 20.0
+_FAR_SIGMAS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A list of control points and where they lie.
+
+    Args:
+        listed: The list.
+        places_m: (n, 3) of its points, ENU.
+        height_note: What was done with their heights.
+    """
+
+    listed: ControlList
+    places_m: Floats
+    height_note: str
+
+    def controls(self, images: Mapping[str, str], log: Log, sigma_m: float) -> tuple[list[Control], dict[str, str]]:
+        """The points that the flight's frames see, and why the rows of some photos are left out.
+
+        Args:
+            images: Path of every image by frame_id.
+            log: The flight, whose order numbers the frames.
+            sigma_m: One sigma of the survey.
+
+        Raises:
+            InputError: A pixel lies outside its photo.
+            NothingLeftError: No row is of a photo of the flight.
+        """
+        marks, left_out = marks_of(self.listed, self.places_m, images, log.cameras)
+        number = {name: i for i, name in enumerate(log.poses)}
+        found = [
+            Control(mark.name, mark.surveyed_m, sigma_m, np.array([number[name] for name in mark.frames]), mark.pixels)
+            for mark in marks
+        ]
+        return found, left_out
+
+
+def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: float | str | None) -> Survey | None:
+    """The control points of a flight.
+
+    Args:
+        location: Path or URL of the list.
+        stated: What their heights are measured from, where their CRS does not say.
+        facts: Of ingest.
+        geoid: As configured.
+
+    Returns:
+        None where no frame of the flight is usable: it then lies nowhere.
+
+    Raises:
+        InputError: The list cannot be read, or its points lie elsewhere.
+        UndeterminedError: The flight lies nowhere on earth, or a height datum is not known.
+        UsageError: `stated` is no height datum.
+    """
+    if facts.get("world", EARTH) == LOCAL_WORLD:
+        raise UndeterminedError(
+            "E-CONTROL-12", "control points are on earth, and nothing says where on earth the run's frame lies",
+            where="refine.control_points", found=location, expected="a flight whose poses have latitude and longitude",
+            hint="leave refine.control_points out",
+        )  # fmt: skip
+    listed = load_control_points(location)
+    if facts["origin"] is None:
+        return None
+    frame = LocalFrame(**facts["origin"])
+    return Survey(listed, *surveyed(listed, frame, str(facts["height_datum"]), geoid, stated, _KEY))
+
+
+def control_facts(fits: Sequence[ControlFit]) -> dict[str, Any]:
+    """Figures of control points for the manifest; those out of sight have no pixels, and are counted.
+
+    Args:
+        fits: At least one.
+    """
+    before, after = (np.concatenate(parts) for parts in zip(*((f.before_px, f.after_px) for f in fits), strict=True))
+    return {
+        "points": len(fits),
+        "observations": len(after),
+        "observations_out_of_sight": int(np.sum(~np.isfinite(after))),
+        "rms_before_px": _rms(before),
+        "rms_after_px": _rms(after),
+        "by_point": {
+            fit.name: {
+                "observations": len(fit.after_px),
+                "rms_before_px": _rms(fit.before_px),
+                "rms_after_px": _rms(fit.after_px),
+            }
+            for fit in fits
+        },
+    }
+
+
+def doubts(flight: RefinedFlight, log: Log) -> list[str]:
+    """What a careful user wants to hear of the control points before believing the result."""
+    told = []
+    after = np.concatenate([fit.after_px for fit in flight.control])
+    if np.median(after) > _WRONG_PX:
+        worst = max(flight.control, key=lambda fit: float(np.median(fit.after_px)))
+        off = float(np.median(worst.after_px))
+        said = f"{off:.0f} px" if np.isfinite(off) else "out of sight"
+        told.append(
+            f"the control points do not fit the photos: half of them are more than {np.median(after):.0f} px off, "
+            f"{worst.name} most ({said}); see that images, column and row, and the height datum are right"
+        )
+    shift = np.mean([flight.frames[name].placed.centre - pose.centre for name, pose in log.poses.items()], axis=0)
+    allowed = np.median([np.hypot(p.common.position_m, p.own.position_m) for p in log.poses.values()], axis=0)
+    if np.any(np.abs(shift) > _FAR_SIGMAS * allowed):
+        east, north, up = shift
+        told.append(
+            f"the control points move the flight by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up, more "
+            f"than {_FAR_SIGMAS:g} sigmas of its log; see that both are of one CRS and height datum"
+        )
+    return told
+
+
+def _rms(values: Floats) -> float | None:
+    seen = values[np.isfinite(values)]
+    return round(float(np.sqrt(np.mean(seen**2))), 3) if len(seen) else None

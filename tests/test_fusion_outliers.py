@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from test_fusion import CAMERA, STATIONS, Flight, point_of
 
 from pipeline.geodesy.local_world import LocalTransform
 from pipeline.geometry.arrays import Bools, Floats, Ints
+from pipeline.points import freespace
 from pipeline.points.covariances import whole
 from pipeline.points.freespace import Views, looked_through
 from pipeline.points.merge import Merged, merge
@@ -111,10 +113,20 @@ class Scene:
     merged: Merged
 
     @classmethod
-    def of(cls, above: Floats, by: list[tuple[int, int]], on_ground: Floats, turn_deg: float = 0.003) -> Scene:
-        pairs = [(1, 0), (2, 1), (3, 2), (4, 3)]
-        own = np.array([turn_deg * np.pi / 180.0] * 3 + [0.002] * 3)
-        covariance = np.diag(np.tile(own**2, len(STATIONS)))
+    def of(
+        cls,
+        above: Floats,
+        by: list[tuple[int, int]],
+        on_ground: Floats,
+        turn_deg: float | Sequence[float] = 0.003,
+        shift_m: float = 0.002,
+        common_m: float = 0.0,
+    ) -> Scene:
+        pairs, n = [(1, 0), (2, 1), (3, 2), (4, 3)], len(STATIONS)
+        turn = np.broadcast_to(np.radians(turn_deg), n)
+        covariance = np.diag(np.concatenate([[t**2] * 3 + [shift_m**2] * 3 for t in turn]))
+        for axis in (3, 4, 5):
+            covariance[axis::6, axis::6] += common_m**2
         flight = Flight(pairs, ground=on_ground, covariance=covariance)
         raised = Flight(by, ground=on_ground[:1].repeat(len(above), axis=0), covariance=covariance)
         raised.points = above
@@ -127,16 +139,18 @@ class Scene:
         errors = flight.errors()
         return cls(flight, observed, track, merge(observed, track, whole(observed, errors), errors))
 
-    def looked_through(self) -> Ints:
+    def views(self) -> Views:
         names = [str(i) for i in range(len(STATIONS))]
-        views = Views(
+        return Views(
             names,
             dict.fromkeys(names, CAMERA),
             dict(zip(names, self.flight.frames, strict=True)),
             self.flight.errors(),
             LocalTransform(),
         )
-        return np.flatnonzero(looked_through(self.observed, self.track, self.merged, views))
+
+    def looked_through(self) -> Ints:
+        return np.flatnonzero(looked_through(self.observed, self.track, self.merged, self.views()))
 
 
 def test_a_point_that_more_frames_look_through_than_saw_it_is_found() -> None:
@@ -162,6 +176,39 @@ def test_frames_that_do_not_know_where_they_look_say_nothing() -> None:
     """With a tenth of a degree the point may as well stand beside what they saw."""
     scene = Scene.of(FLOATER[None], [(1, 0)], behind(FLOATER, [2, 3, 4]), turn_deg=0.1)
     assert scene.looked_through().tolist() == []
+
+
+def test_frames_that_do_not_know_their_own_turn_say_nothing() -> None:
+    """Though those that saw the point know theirs."""
+    known = {"above": FLOATER[None], "by": [(2, 0)], "on_ground": behind(FLOATER, [1, 3, 4])}
+    for turn, found in ((0.003, [3]), (0.1, [])):
+        assert Scene.of(**known, turn_deg=[0.003, turn, 0.003, turn, turn]).looked_through().tolist() == found
+
+
+def test_what_all_frames_share_does_not_shield_it_and_its_depth_s_own_error_does() -> None:
+    by, on_ground = [(2, 0)], behind(FLOATER, [1, 3, 4])
+    assert Scene.of(FLOATER[None], by, on_ground, common_m=20.0).looked_through().tolist() == [3]
+    scene = Scene.of(FLOATER[None], by, on_ground)
+    best = scene.merged.best[3]
+    # So unsure along the sight of frame 1, that the ground may be there.
+    sight = FLOATER - STATIONS[1][1]
+    sight /= np.linalg.norm(sight)
+    for sigma_m, found in ((2.0, [3]), (8.0, [])):
+        scene.observed.independent[best] = sigma_m**2 * sight[:, None] * sight
+        scene.observed.jacobian[best] *= 0.0
+        assert _claimed_by(scene, 1) == found
+
+
+def _claimed_by(scene: Scene, frame: int) -> list[int]:
+    """What one frame's claims alone find."""
+    views = scene.views()
+    placed = views.placements[str(frame)]
+    rows = np.flatnonzero((scene.observed.frames == frame).any(axis=1))
+    pixels = [
+        scene.observed.ref_px[i] if scene.observed.frames[i, 0] == frame else scene.observed.src_px[i] for i in rows
+    ]
+    claims = freespace._claims(scene.merged.xyz, placed, CAMERA, np.array(pixels), scene.track[rows])
+    return claims.point[freespace._sure(claims, scene.observed, scene.merged, views, frame)].tolist()
 
 
 def test_a_thin_pole_with_ground_beside_it_survives() -> None:

@@ -55,11 +55,12 @@ class Views:
 
 @dataclass(frozen=True, slots=True)
 class _Claims:
-    """What a frame holds against points: rows of points, of the points it saw instead, and both directions."""
+    """What a frame holds against points: their rows, those of the points it saw instead, and where both lie from it."""
 
     point: Ints
     seen: Ints
-    offset: Floats
+    to_point: Floats
+    to_seen: Floats
 
 
 def looked_through(observed: Observed, track: Ints, merged: Merged, views: Views) -> Bools:
@@ -106,7 +107,8 @@ def _claims(p_in_enu: Floats, placed: Placement, camera: Camera, pixel: Floats, 
     hit = np.isfinite(distance)
     point, other = rows[hit], seen[nearest[hit]]
     nearer = in_cam[point, 2] < (1.0 - _SHARE) * in_cam[other, 2]
-    return _Claims(point[nearer], other[nearer], p_in_enu[point[nearer]] - placed.centre)
+    point, other = point[nearer], other[nearer]
+    return _Claims(point, other, p_in_enu[point] - placed.centre, p_in_enu[other] - placed.centre)
 
 
 def _in_view(in_cam: Floats, camera: Camera) -> Bools:
@@ -123,31 +125,39 @@ def _sure(claims: _Claims, observed: Observed, merged: Merged, views: Views, fra
     """Which claims hold: the point is nearer by more than both errors, and its place in the image is known."""
     name = views.names[frame]
     to_crs = views.transform.jacobian(views.placements[name].centre)
-    range_m = np.linalg.norm(claims.offset, axis=1)
-    sight = claims.offset @ to_crs.T / range_m[:, None]
+    of_point, known = _relative(merged.best[claims.point], claims.to_point, observed, views.errors, frame, to_crs)
+    of_seen, known_too = _relative(merged.best[claims.seen], claims.to_seen, observed, views.errors, frame, to_crs)
+    range_m = np.linalg.norm(claims.to_point, axis=1)
+    sight = claims.to_point @ to_crs.T / range_m[:, None]
     gap = np.sum((merged.xyz[claims.seen] - merged.xyz[claims.point]) * sight, axis=1)
-    both = merged.covariance[claims.seen] + merged.covariance[claims.point]
-    apart = gap > _SIGMAS * np.sqrt(np.einsum("ni,nij,nj->n", sight, both, sight))
+    apart = gap > _SIGMAS * np.sqrt(np.einsum("ni,nij,nj->n", sight, of_point + of_seen, sight))
     across = np.eye(3) - sight[:, :, None] * sight[:, None, :]
-    relative, kept = _relative(claims, observed, merged, views.errors, frame, to_crs)
-    beside = across @ relative @ across
-    beside_m = np.sqrt(np.trace(beside, axis1=1, axis2=2) / 2.0)
-    known = beside_m * views.cameras[name].focal_px <= _PLACED_PX * range_m
-    out: Bools = apart & known & kept
+    beside_m = np.sqrt(np.trace(across @ of_point @ across, axis1=1, axis2=2) / 2.0)
+    placed = beside_m * views.cameras[name].focal_px <= _PLACED_PX * range_m
+    out: Bools = apart & placed & known & known_too
     return out
 
 
 def _relative(
-    claims: _Claims, observed: Observed, merged: Merged, errors: PoseErrors, frame: int, to_crs: Floats
+    best: Ints, offset: Floats, observed: Observed, errors: PoseErrors, frame: int, to_crs: Floats
 ) -> tuple[Floats, Bools]:
-    """Covariance of a point's error less the displacement of the frame's ray there, by its best observation.
+    """Covariance of points' errors less the displacement of a frame's rays there, by their best observations.
+
+    What the frame shares with those that made the point does not count: it moves both.
+
+    Args:
+        best: (n,) rows of the observations.
+        offset: (n, 3) m, ENU, from the frame to the points.
+        observed: The observations.
+        errors: Between the frames.
+        frame: Number of the frame.
+        to_crs: (3, 3) from ENU to the dataset's CRS.
 
     Returns:
         (n, 3, 3) m^2 and (n,) whether every covariance between the frames is kept.
     """
-    best = merged.best[claims.point]
     of_best = observed.jacobian[best].reshape(-1, 3, 2, 6).transpose(0, 2, 1, 3)
-    by_frame = to_crs @ np.concatenate([-skew(claims.offset), np.broadcast_to(np.eye(3), (len(best), 3, 3))], axis=2)
+    by_frame = to_crs @ np.concatenate([-skew(offset), np.broadcast_to(np.eye(3), (len(best), 3, 3))], axis=2)
     factors = np.concatenate([of_best, -by_frame[:, None]], axis=1)
     frames = np.concatenate([observed.frames[best], np.full((len(best), 1), frame)], axis=1)
     found, known = of_groups(factors, frames, errors)

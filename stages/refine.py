@@ -25,7 +25,7 @@ from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
 from pipeline.refinement.pair import refine_pair, surest_frames
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
-from pipeline.refinement.surveyed import Survey, control_facts, doubts, survey
+from pipeline.refinement.surveyed import Survey, doubts, survey
 from pipeline.refinement.telling import facts_of, sentence
 from pipeline.sources.files import is_url
 from schemas import MATCHES, RELATIVE_POSES
@@ -122,10 +122,8 @@ def run(config: Config, context: Context) -> str:
     cameras = log.cameras if flight is None else flight.cameras
     context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
-    if flight is not None and flight.control:
-        facts["control_points"] = control_facts(flight.control)
-        for doubt in doubts(flight, log):
-            context.warn(doubt)
+    for doubt in doubts(flight, log):
+        context.warn(doubt)
     for name, value in facts.items():
         context.record(name, value)
     return sentence(counted(len(pairs), "pair"), config.mode, facts)
@@ -152,9 +150,8 @@ def _control(config: Config, context: Context, log: Log) -> list[Control]:
     found = _survey(config, context.setting, context.facts("ingest"))
     if found is None:
         return []
-    frames = context.read("frames")
-    images = dict(zip(column(frames, "frame_id"), column(frames, "image"), strict=True))
-    control, left_out = found.controls(images, log, config.control_sigma_m)
+    names = (column(context.read("frames"), name) for name in ("frame_id", "image"))
+    control, left_out = found.controls(dict(zip(*names, strict=True)), log, config.control_sigma_m)
     context.record("control_heights", found.height_note)
     context.record("control_left_out", left_out)
     if left_out:

@@ -113,9 +113,11 @@ def control_facts(fits: Sequence[ControlFit]) -> dict[str, Any]:
     }
 
 
-def doubts(flight: RefinedFlight, log: Log) -> list[str]:
+def doubts(flight: RefinedFlight | None, log: Log) -> list[str]:
     """What a careful user wants to hear of the control points before believing the result."""
-    told = []
+    told: list[str] = []
+    if flight is None or not flight.control:
+        return told
     after = np.concatenate([fit.after_px for fit in flight.control])
     if np.median(after) > _WRONG_PX:
         worst = max(flight.control, key=lambda fit: float(np.median(fit.after_px)))

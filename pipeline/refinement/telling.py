@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.refinement.flight.flight import Found, RefinedFlight
 from pipeline.refinement.rows import FLIGHT, NONE, RefinedPair
+from pipeline.refinement.surveyed import control_facts
 
 # An unknown of which the images leave less than half of what the log left open is worth a word.
 _TOLD = 0.5
@@ -47,6 +48,8 @@ def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict
         out["frames_refined"] = sum(frame.refined for frame in flight.frames.values())
         out["frames_off_the_log"] = {name: frame.problem for name, frame in flight.frames.items() if frame.problem}
         out["information_divided_by"] = round(flight.scatter, 3)
+        if flight.control:
+            out["control_points"] = control_facts(flight.control)
     return out
 
 

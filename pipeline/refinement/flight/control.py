@@ -156,7 +156,9 @@ def offsets_px(control: Control, at: Sequence[Placement], cameras: Sequence[Came
         for placed, camera in zip(at, cameras, strict=True)
     ]
     away = np.linalg.norm(np.stack(projected) - control.pixels, axis=1)
-    return np.where(np.isfinite(away), away, np.inf)
+    # Beside the camera a pixel is as far as one likes.
+    most = np.array([camera.width + camera.height for camera in cameras], np.float64)
+    return np.where(away < most, away, np.inf)
 
 
 def _linearised(

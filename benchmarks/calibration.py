@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from flight_truth import BETWEEN, LEGS, FlightTruth, configured, reprojection_errors
-from redraws import redrawn_poses, square_of, turned
+from redraws import PARTS, redrawn_poses, squares_of, turned
 from refitted import Matches, Refit
 
 from pipeline.depthing import Limits, MatchedRays, depths_by
@@ -239,7 +239,7 @@ def outcomes(
         mode: One of MODES.
         matches: All of the run, to refine on.
         jobs: Processes.
-        squares: Is filled with the squares of every pair's relative pose error, a row (pairs,) per redraw.
+        squares: Is filled with the squares of every pair's relative pose error, (pairs, parts) per redraw.
     """
     rng = np.random.default_rng([SEED, 1])
     drawn = [redrawn_poses(truth.poses, logged, rng) for _ in range(redraws)]
@@ -249,7 +249,7 @@ def outcomes(
         done = [one for some in executor.map(partial(_redraws, setting), shards) for one in some]
     if squares is not None:
         squares += [
-            np.array([square_of(refit.relative[pair.pair.pair_id], truth, pair.pair) for pair in pairs])
+            np.array([squares_of(refit.relative[pair.pair.pair_id], truth, pair.pair) for pair in pairs])
             for _, refit in done
         ]
     true_depth = np.concatenate([pair.depth_m for pair in pairs])
@@ -283,6 +283,17 @@ def lines(found: Mapping[str, Outcome], pairs: Sequence[PairTruth]) -> Iterator[
             yield f"{title:26}{name:10}{shares}{rest}{np.mean(outcome.wrong[rows]):8.2%}"
 
 
+def pose_lines(squares: Sequence[Floats]) -> Iterator[str]:
+    """The relative poses' errors in units of their covariances: means over the pairs, errors between the redraws."""
+    per_redraw = np.mean(squares, axis=1)
+    mean, error = np.mean(per_redraw, axis=0), np.std(per_redraw, axis=0) / np.sqrt(len(per_redraw))
+    cells = (
+        f"{name} {value:.2f} +- {off:.2f} of {size}"
+        for (name, size), value, off in zip(PARTS.items(), mean, error, strict=True)
+    )
+    yield "relative poses, mean squares: " + ", ".join(cells)
+
+
 def main(example: Path, run: Path, redraws: int, modes: Sequence[str]) -> None:
     """Prints the tables."""
     truth = FlightTruth.of(example)
@@ -310,10 +321,8 @@ def main(example: Path, run: Path, redraws: int, modes: Sequence[str]) -> None:
         print(f"{'':36}{heads}")
         for line in lines(found, pairs):
             print(line)
-        per_redraw = np.mean(squares, axis=1)
-        error = np.std(per_redraw) / np.sqrt(len(per_redraw))
-        print(f"relative poses: mean square {np.mean(per_redraw):.2f} +- {error:.2f}, to be expected 6;", end=" ")
-        print(f"median {np.median(squares):.2f}, of a Gaussian 5.35")
+        for line in pose_lines(squares):
+            print(line)
     middle = np.median(np.concatenate([pair.squares for pair in pairs]))
     print(
         f"\nMatched positions: the median square in units of their covariance is {middle:.2f}; Gaussian {MEDIAN_SQUARE}"

@@ -48,13 +48,22 @@ def turned(rotation: Floats, turn_rad: Floats) -> Floats:
     return out
 
 
-def square_of(found: RelativePose, truth: FlightTruth, pair: PairRow) -> float:
-    """The square of a relative pose's error in units of its covariance; 6 is to be expected."""
+PARTS = {"whole": 6, "turn": 3, "direction": 2, "length": 1}
+"""Parts of a relative pose's error, and how many unknowns each has: what the mean of its square should be."""
+
+
+def squares_of(found: RelativePose, truth: FlightTruth, pair: PairRow) -> Floats:
+    """(4,) squares of a relative pose's error and of its PARTS, each in units of its own covariance."""
     ref, src = truth.poses[pair.ref], truth.poses[pair.src]
-    # How much src is turned and shifted too far, seen on ref's axes.
+    # How much src is turned and shifted too far, seen on ref's axes; the shift then along and across the baseline.
     turn = vector_from_rotation(found.rotation.T @ (src.rotation.T @ ref.rotation))
-    error = np.concatenate([turn, found.centre - ref.rotation.T @ (src.centre - ref.centre)])
-    return float(error @ np.linalg.solve(found.covariance, error))
+    baseline = ref.rotation.T @ (src.centre - ref.centre)
+    axes = np.eye(6)
+    axes[3:, 3:] = np.linalg.qr(np.column_stack([baseline, np.eye(3)]))[0].T
+    error = axes @ np.concatenate([turn, found.centre - baseline])
+    covariance = axes @ found.covariance @ axes.T
+    parts = [slice(0, 6), slice(0, 3), slice(4, 6), slice(3, 4)]
+    return np.array([error[part] @ np.linalg.solve(covariance[part, part], error[part]) for part in parts])
 
 
 def times_of(run: Path) -> dict[str, float]:

@@ -21,7 +21,7 @@ import pyarrow.dataset as ds
 from example_truth import MAX_RANGE_M, clipped, coded
 from flight_truth import LEGS, FlightTruth, configured, facts
 from planted import CASES, Case, planted_poses, planted_run
-from redraws import square_of, times_of
+from redraws import squares_of, times_of
 
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.tables import read_table
@@ -172,7 +172,7 @@ def pose_nees(run: Path, truth: FlightTruth) -> Floats:
     """(p,) squares of the errors of all pairs' relative poses in units of their covariances."""
     poses = relative_poses_of(read_table(run / "relative_poses.parquet", "relative_poses"))
     pairs = selected_pairs(read_table(run / "pairs.parquet", "pairs"))
-    return np.array([square_of(poses[pair.pair_id], truth, pair) for pair in pairs])
+    return np.array([squares_of(poses[pair.pair_id], truth, pair)[0] for pair in pairs])
 
 
 def outcomes(base: Path, case: Case, truth: FlightTruth, run: Path) -> Iterator[Outcome]:

@@ -75,6 +75,12 @@ def placements_of(table: pa.Table) -> dict[str, Placement]:
     return dict(zip(table.column("frame_id").to_pylist(), _placements(table), strict=True))
 
 
+def covariances_of(table: pa.Table) -> dict[str, Floats]:
+    """The (6, 6) covariance of every row of `poses`: turn (rad) and shift (m), ENU."""
+    found = np.array(table.column("cov").to_pylist(), np.float64).reshape(-1, 6, 6)
+    return dict(zip(table.column("frame_id").to_pylist(), found, strict=True))
+
+
 def _placements(table: pa.Table, role: str = "") -> list[Placement]:
     if not table.num_rows:
         return []

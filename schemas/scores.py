@@ -4,7 +4,7 @@ from schemas._columns import TableSchema, flag, number, single, text
 
 SCORES = TableSchema(
     "pixels",
-    1,
+    2,
     "Depths beside the reference depth at the same pixel.",
     (
         text("pair_id", "The pair in `pairs`."),
@@ -16,6 +16,7 @@ SCORES = TableSchema(
         number("sigma_depth_m", "m", "Its predicted sigma.", frame="ref RDF", nullable=True),
         number("reference_m", "m", "Reference depth at the pixel.", frame="ref RDF"),
         single("reference_spread_m", "m", "Spread of the reference about its local surface."),
+        single("reference_sigma_m", "m", "One sigma of the reference by the error of the frame's pose."),
         flag("kept", "Whether the method keeps the depth."),
     ),
 )

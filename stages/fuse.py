@@ -118,7 +118,7 @@ def _scene(context: Context) -> Scene:
     return Scene(
         image_locations(frames, str(facts["photo_root"]), context.path("images")),
         dict(zip(ids, usable.column("time").cast("int64").to_pylist(), strict=True)),
-        camera_by_frame(frames, cameras_of(context.read("cameras"))),
+        camera_by_frame(frames, cameras_of(context.read("refined_cameras"))),
         placements_of(context.read("poses")),
         pose_errors_of(context.read("pose_covariances")),
         {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))},
@@ -151,7 +151,7 @@ STAGE = Stage(
     "fuse",
     3,
     Config,
-    ("frames", "cameras", "poses", "pose_covariances", "relative_poses", "pairs", "depths", "images"),
+    ("frames", "refined_cameras", "poses", "pose_covariances", "relative_poses", "pairs", "depths", "images"),
     ("points",),
     run,
     reads=("ingest.crs", "ingest.geoid", "depth.methods"),

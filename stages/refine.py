@@ -147,28 +147,26 @@ def _flight(
 
 
 def _control(config: Config, context: Context, log: Log) -> list[Control]:
-    found = _survey(config, context.setting, context.facts("ingest"))
-    if found is None:
+    if config.control_points is None:
         return []
+    found = _survey(config, context.setting("ingest.geoid"), context.facts("ingest"))
     names = (column(context.read("frames"), name) for name in ("frame_id", "image"))
     control, left_out = found.controls(dict(zip(*names, strict=True)), log, config.control_sigma_m)
     context.record("control_heights", found.height_note)
     context.record("control_left_out", left_out)
-    if left_out:
-        named, why = next(iter(left_out.items()))
+    for named, why in list(left_out.items())[:1]:
         context.warn(f"control points in {counted(len(left_out), 'photo')} are not used: {named} among them, {why}")
     return control
 
 
-def _survey(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> Survey | None:
-    if config.control_points is None:
-        return None
-    return survey(config.control_points, config.control_height_datum, facts, setting("ingest.geoid"))
+def _survey(config: Config, geoid: Any, facts: Mapping[str, Any]) -> Survey:
+    return survey(str(config.control_points), config.control_height_datum, facts, geoid)
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
     """Refuses control points that cannot be read or brought into the flight's frame."""
-    _survey(config, setting, facts)
+    if config.control_points is not None:
+        _survey(config, setting("ingest.geoid"), facts)
 
 
 def sources(config: Config) -> tuple[Path | str, ...]:

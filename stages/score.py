@@ -15,7 +15,7 @@ from pydantic import Field
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
-from pipeline.flight import camera_by_frame, cameras_of, placements_of
+from pipeline.flight import camera_by_frame, cameras_of, covariances_of, placements_of
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.lidar.nearby import LocalTiles
@@ -133,9 +133,11 @@ def _sweeps(folder: Path) -> tuple[Path, ...]:
 def _views(context: Context, wanted: set[str]) -> list[FrameView]:
     """The frames that have depths, in the order of `poses`."""
     cameras = camera_by_frame(context.read("frames"), cameras_of(context.read("refined_cameras")))
+    poses = context.read("poses")
+    covariances = covariances_of(poses)
     return [
-        FrameView(frame_id, View(cameras[frame_id], pose.centre, pose.rotation))
-        for frame_id, pose in placements_of(context.read("poses")).items()
+        FrameView(frame_id, View(cameras[frame_id], pose.centre, pose.rotation), covariances[frame_id])
+        for frame_id, pose in placements_of(poses).items()
         if frame_id in wanted
     ]
 
@@ -149,7 +151,10 @@ def _tell(context: Context, scores: Sequence[FrameScore], tiles: LocalTiles, mee
     context.record("matches", sum(score.n_matches for score in scores))
     context.record("matches_with_reference", sum(score.methods[0].n_scored for score in scores))
     context.record("frames_that_see_no_lidar", blind)
-    context.record("calibration_sigma", "predicted sigma and the reference's spread, in quadrature")
+    context.record(
+        "calibration_sigma",
+        "predicted sigma, the reference's spread and what the pose's sigma makes of it, in quadrature",
+    )
     if blind:
         context.warn(f"{len(blind)} of {len(scores)} frames see no LiDAR return, {blind[0]} among them")
 
@@ -161,7 +166,7 @@ def sources(config: Config) -> tuple[Path, ...]:
 
 STAGE = Stage(
     "score",
-    1,
+    2,
     Config,
     ("frames", "refined_cameras", "poses", "depths", "sweeps"),
     ("scores",),

@@ -232,13 +232,14 @@ def run_folder(folder: Path, *, refined: bool = False) -> dict[str, tuple[np.nda
         row = {
             "frame_id": f"F{number}", "image": f"day/F {number}.JPG", "image_sha256": "0", "camera_id": camera_id,
             "time_source": "", "height_datum": "ellipsoidal", "pose_source": "", "usable": number < 4, "problem": "",
-            **dict.fromkeys(sigmas, 0.1),
+            **dict.fromkeys(sigmas + [f"own_{name}" for name in sigmas], 0.1),
         }  # fmt: skip
         pose = dict(zip(("qw", "qx", "qy", "qz"), quaternion_from_rotation(rotation), strict=True))
         place = ("east_m", "north_m", "up_m")
         frames.append(row | pose | dict(zip(place, centre, strict=True)))
         if number < 4:
-            named = {"frame_id": f"F{number}", **dict.fromkeys(sigmas, 0.1)}
+            named = {"frame_id": f"F{number}", "cov": [0.0] * 36, "refined": True, "problem": ""}
+            named |= dict.fromkeys(sigmas, 0.1)
             poses.append(named | pose | dict(zip(place, moved, strict=True)))
             expected[f"day/F {number}.JPG"] = (rotation, moved, CAMERAS[camera_id])
     cameras = [
@@ -249,6 +250,7 @@ def run_folder(folder: Path, *, refined: bool = False) -> dict[str, tuple[np.nda
     write_table(folder / "frames.parquet", TABLES["frames"].from_rows(frames))
     write_table(folder / "cameras.parquet", TABLES["cameras"].from_rows(cameras))
     if refined:
+        write_table(folder / "refined_cameras.parquet", TABLES["refined_cameras"].from_rows(cameras))
         write_table(folder / "poses.parquet", TABLES["poses"].from_rows(poses))
     return expected
 

@@ -123,7 +123,7 @@ def test_redraws_spread_as_the_covariance_says() -> None:
 
 def test_the_common_position_error_cancels_and_common_angles_do_not() -> None:
     shifted = PoseSigmas(np.array([9.0, 9.0, 9.0]), np.zeros(3))
-    np.testing.assert_array_equal(pair(NONE, shifted).covariance, np.zeros((6, 6)))
+    np.testing.assert_allclose(pair(NONE, shifted).covariance, np.zeros((6, 6)), atol=1e-28)
     turned = PoseSigmas(np.zeros(3), np.array([1.0, 0.0, 0.0]) * DEG)
     covariance = pair(NONE, turned).covariance
     # A compass error common to both turns neither against the other, but swings src about ref by the level baseline.

@@ -22,7 +22,7 @@ from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.transform import to_enu
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import enu_from_cam, quaternion_from_rotation
-from schemas import CAMERAS, DEPTHS, FRAMES, POSES, SCORES
+from schemas import DEPTHS, FRAMES, POSES, REFINED_CAMERAS, SCORES
 from stages.score import STAGE, Config
 
 ORIGIN = {"latitude_deg": 37.5, "longitude_deg": -78.3, "height_m": 120.0}
@@ -115,7 +115,7 @@ def depth_rows() -> list[dict[str, Any]]:
             for k, (u, v) in enumerate(pixels):
                 depth = scale * truth[k]
                 rows.append(
-                    {"pair_id": f"{frame}~x", "frame_id": frame, "u": u, "v": v, "method": method, "depth_m": depth,
+                    {"pair_id": f"{frame}~x", "frame_id": frame, "u": u, "v": v, "src_u": u, "src_v": v, "method": method, "depth_m": depth,
                      "sigma_depth_m": 0.08 * depth, "parallax_deg": 3.0, "kept": k % 4 < 4 * share, "reason": ""}
                 )  # fmt: skip
     return rows
@@ -124,12 +124,13 @@ def depth_rows() -> list[dict[str, Any]]:
 def make_context(folder: Path, *, datum: str = "ellipsoidal", **changes: Any) -> FakeContext:
     q = quaternion_from_rotation(rotation())
     poses = [
-        {"frame_id": name, "east_m": e, "north_m": n, "up_m": HEIGHT_M, "qw": q[0], "qx": q[1], "qy": q[2], "qz": q[3]}
+        {"frame_id": name, "east_m": e, "north_m": n, "up_m": HEIGHT_M, "qw": q[0], "qx": q[1], "qy": q[2], "qz": q[3],
+         "problem": ""}
         for name, (e, n) in FRAMES_AT.items()
-    ]
+    ]  # fmt: skip
     frames = [
         {**pose, "image": f"{pose['frame_id']}.jpg", "image_sha256": "", "camera_id": "c", "time_source": "",
-         "usable": True, "height_datum": datum, "pose_source": "", "problem": ""}
+         "usable": True, "height_datum": datum, "pose_source": ""}
         for pose in poses
     ]  # fmt: skip
     camera = {"camera_id": "c", "model": "brown", "width": 400, "height": 300, "fx": 350.0, "fy": 350.0, "cx": 199.5,
@@ -141,8 +142,8 @@ def make_context(folder: Path, *, datum: str = "ellipsoidal", **changes: Any) ->
         pq.write_table(DEPTHS.from_rows(part), folder / "depths" / f"part-{i:05d}.parquet")
     tables = {
         "frames": FRAMES.from_rows(frames),
-        "poses": POSES.from_rows(poses),
-        "cameras": CAMERAS.from_rows([camera]),
+        "poses": POSES.from_rows({**pose, "cov": np.zeros(36).tolist(), "refined": False} for pose in poses),
+        "refined_cameras": REFINED_CAMERAS.from_rows([camera]),
     }
     return FakeContext(folder, tables, {"ingest.geoid": UNDULATION_M}, {"origin": ORIGIN}, **changes)
 

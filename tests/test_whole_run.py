@@ -21,7 +21,10 @@ from pipeline.flight import relative_poses_of
 from schemas import TABLES
 from stages.app import run as command_line
 
-TABLE_FILES = {"cameras", "frames", "tracks", "clocks", "pairs", "relative_poses", "poses"}
+TABLE_FILES = {"cameras", "frames", "tracks", "clocks", "pairs", "relative_poses", "poses"} | {
+    "pose_covariances",
+    "refined_cameras",
+}
 
 
 def test_a_run_holds_what_the_contract_says(small_run: Path) -> None:

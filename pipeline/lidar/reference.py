@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.arrays import Bools, Floats
+from pipeline.geometry.arrays import AnyArray, Bools, Floats
 from pipeline.lidar.visibility import VisibleReturns
 
 # Returns a plane is fitted to: three unknowns, and enough over to see that it is no plane.
@@ -30,12 +30,24 @@ class Reference:
     Args:
         depth_m: (n,) along the optical axis, m; NaN where there is none.
         spread_m: (n,) root mean square of the returns about the local surface, in depth, m; NaN where there is none.
+        slope: (n, 2) change of the inverse depth per ideal pixel, 1/(m px): the local plane; NaN where there is none.
         valid: (n,) whether there is one.
     """
 
     depth_m: Floats
     spread_m: Floats
+    slope: Floats
     valid: Bools
+
+    @classmethod
+    def none(cls, count: int) -> Reference:
+        """No reference at so many pixels."""
+        nothing = np.full(count, np.nan)
+        return cls(nothing, nothing, np.full((count, 2), np.nan), np.zeros(count, np.bool_))
+
+    def where(self, rows: AnyArray) -> Reference:
+        """Those at some pixels."""
+        return Reference(self.depth_m[rows], self.spread_m[rows], self.slope[rows], self.valid[rows])
 
 
 def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal_visible: Floats) -> Reference:
@@ -53,26 +65,27 @@ def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturn
         One depth per pixel.
     """
     count = len(pixels)
-    depth, spread = np.full(count, np.nan), np.full(count, np.nan)
+    depth, spread, slope = np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan)
     ok = np.isfinite(pixels).all(axis=1) & np.isfinite(ideal_pixels).all(axis=1)
     rows = np.flatnonzero(ok)
     if len(visible.depth_m) < NEIGHBOURS or not len(rows):
-        return Reference(depth, spread, np.zeros(count, np.bool_))
+        return Reference.none(count)
     distance, near = (np.asarray(found) for found in cKDTree(visible.pixels).query(pixels[rows], k=NEIGHBOURS))
     reach = np.maximum(_REACH_FOOTPRINTS * np.median(visible.footprint_px[near], axis=1), _LEAST_REACH_PX)
     close = distance[:, -1] <= reach
     rows, near = rows[close], near[close]
-    inverse, residual, sound = _plane_at_centre(
+    inverse, gradient, residual, sound = _plane_at_centre(
         ideal_visible[near] - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
     )
     sound &= (inverse > 0.0) & (residual <= _LARGEST_SPREAD * inverse)
     rows, inverse, residual = rows[sound], inverse[sound], residual[sound]
     depth[rows] = 1.0 / inverse
     spread[rows] = residual / inverse**2
-    return Reference(depth, spread, np.isfinite(depth))
+    slope[rows] = gradient[sound]
+    return Reference(depth, spread, slope, np.isfinite(depth))
 
 
-def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Bools]:
+def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Floats, Bools]:
     """Least-squares affine function through neighbours, at offset zero.
 
     Args:
@@ -80,8 +93,8 @@ def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, B
         inverse: (n, k) inverse depths, 1/m.
 
     Returns:
-        Value at zero (n,), root mean square residual with k - 3 degrees of freedom (n,), and whether the neighbours
-        surround the pixel and fix a plane (n,).
+        Value at zero (n,), slope (n, 2), root mean square residual with k - 3 degrees of freedom (n,), and whether the
+        neighbours surround the pixel and fix a plane (n,).
     """
     mean = offset.mean(axis=1)
     centred = offset - mean[:, None, :]
@@ -95,4 +108,4 @@ def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, B
     slope = np.linalg.solve(scatter, moment[..., None])[..., 0]
     residual = inverse - level[:, None] - np.einsum("nki,ni->nk", centred, slope)
     rms = np.sqrt(np.sum(residual**2, axis=1) / (offset.shape[1] - 3))
-    return level - np.einsum("ni,ni->n", mean, slope), rms, sound
+    return level - np.einsum("ni,ni->n", mean, slope), slope, rms, sound

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.engine.errors import UndeterminedError
+from pipeline.engine.errors import NothingLeftError, UndeterminedError
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.geometry.arrays import Floats
@@ -59,7 +59,7 @@ class Survey:
         return found, left_out
 
 
-def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: float | str | None) -> Survey | None:
+def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: float | str | None) -> Survey:
     """The control points of a flight.
 
     Args:
@@ -68,13 +68,11 @@ def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: f
         facts: Of ingest.
         geoid: As configured.
 
-    Returns:
-        None where no frame of the flight is usable: it then lies nowhere.
-
     Raises:
         InputError: The list cannot be read, or its points lie elsewhere.
         UndeterminedError: The flight lies nowhere on earth, or a height datum is not known.
         UsageError: `stated` is no height datum.
+        NothingLeftError: No frame of the flight is usable.
     """
     if facts.get("world", EARTH) == LOCAL_WORLD:
         raise UndeterminedError(
@@ -84,7 +82,10 @@ def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: f
         )  # fmt: skip
     listed = load_control_points(location)
     if facts["origin"] is None:
-        return None
+        raise NothingLeftError(
+            "E-CONTROL-13", "no photo of the flight is usable, and control points are of no help", where=location,
+            hint="the table frames says why; leave refine.control_points out to go on",
+        )  # fmt: skip
     frame = LocalFrame(**facts["origin"])
     return Survey(listed, *surveyed(listed, frame, str(facts["height_datum"]), geoid, stated, _KEY))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +32,12 @@ class FrameView:
     Args:
         frame_id: Its name.
         view: Its camera and pose.
+        covariance: (6, 6) of that pose: turn (rad) and shift (m), ENU.
     """
 
     frame_id: str
     view: View
+    covariance: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +122,11 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
         reference, seen = _reference(item.view, mine.pixels, near, job.max_range_m)
         has = np.flatnonzero(reference.valid)
         scored = mine.where(has)
-        depth, spread = reference.depth_m[has], reference.spread_m[has]
-        sums = _sums(item.view, scored, depth, spread)
+        found = reference.where(has)
+        by_pose = reference_sigma(item.view, scored.pixels, found, item.covariance)
+        sums = _sums(item.view, scored, found.depth_m, np.hypot(found.spread_m, by_pose))
         scores.append(FrameScore(item.frame_id, len(mine.pixels), seen, *sums))
-        tables.append(_table(scored, depth, spread))
+        tables.append(_table(scored, found, by_pose))
     return pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores
 
 
@@ -148,8 +151,7 @@ def _distinct(depths: Path, column: str) -> set[str]:
 def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: float) -> tuple[Reference, int]:
     """Reference depths at pixels within range, and how many returns the frame sees."""
     if not len(near.returns) or not len(pixels):
-        nothing = np.full(len(pixels), np.nan)
-        return Reference(nothing, nothing, np.zeros(len(pixels), np.bool_)), 0
+        return Reference.none(len(pixels)), 0
     visible = visible_returns(view, near.returns, near.field, near.spacing_m, max_range_m)
     # The same feature is matched in several pairs: its reference is found once.
     distinct, back = np.unique(pixels, axis=0, return_inverse=True)
@@ -160,13 +162,36 @@ def _reference(view: View, pixels: Floats, near: _Surroundings, max_range_m: flo
         # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.
         points = view.centre_in_enu_m + (found.depth_m[:, None] * rays)[valid] @ view.rotation_enu_from_cam.T
         valid[valid] = ~behind_columns(view.centre_in_enu_m, points, near.field, max_range_m)
-    back = back.ravel()
-    depth, spread = (np.where(valid, values, np.nan)[back] for values in (found.depth_m, found.spread_m))
-    return Reference(depth, spread, valid[back]), len(visible.depth_m)
+    return replace(found, valid=valid).where(back.ravel()), len(visible.depth_m)
+
+
+def reference_sigma(view: View, pixels: Floats, reference: Reference, covariance: Floats) -> Floats:
+    """What an error of the frame's pose does to the reference depths at its pixels.
+
+    The local plane is N . p = 1 in the camera, and the depth on a ray v is s = 1 / (N . v). A shift e of the camera
+    changes it by -s N . e, a turn t by s^2 t . (N x v).
+
+    Args:
+        view: The frame's camera and pose.
+        pixels: (n, 2) px.
+        reference: At these pixels.
+        covariance: (6, 6) of turn (rad) and shift (m), ENU.
+
+    Returns:
+        (n,) one sigma, m.
+    """
+    v = view.camera.rays(pixels)
+    level = reference.slope * view.camera.focal_px
+    normal = np.column_stack([level, 1.0 / reference.depth_m - np.sum(level * v[:, :2], axis=1)])
+    s = reference.depth_m[:, None]
+    in_enu = view.rotation_enu_from_cam.T
+    jacobian = np.concatenate([(s**2 * np.cross(normal, v)) @ in_enu, (-s * normal) @ in_enu], axis=1)
+    out: Floats = np.sqrt(np.einsum("ni,ij,nj->n", jacobian, covariance, jacobian))
+    return out
 
 
 def _sums(
-    view: View, scored: AlignedDepths, reference: Floats, spread: Floats
+    view: View, scored: AlignedDepths, reference: Floats, reference_sigma_m: Floats
 ) -> tuple[tuple[MethodSums, ...], CalibrationSums, MapSums]:
     common = np.asarray(scored.kept.all(axis=1))
     methods = tuple(
@@ -177,14 +202,14 @@ def _sums(
     depth, reference = scored.depth_m[kept, 0], reference[kept]
     return (
         methods,
-        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, spread[kept]),
+        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, reference_sigma_m[kept]),
         MapSums.of(depth, reference, rays),
     )
 
 
-def _table(scored: AlignedDepths, reference: Floats, spread: Floats) -> pa.Table:
+def _table(scored: AlignedDepths, reference: Reference, by_pose: Floats) -> pa.Table:
     """One row per pixel and method, the methods of a pixel together."""
-    n, count = len(reference), len(scored.methods)
+    n, count = len(by_pose), len(scored.methods)
     depth, sigma = scored.depth_m.ravel(), scored.sigma_m.ravel()
     return SCORES.from_columns(
         {
@@ -195,8 +220,9 @@ def _table(scored: AlignedDepths, reference: Floats, spread: Floats) -> pa.Table
             "method": list(scored.methods) * n,
             "depth_m": pa.array(depth, mask=~np.isfinite(depth)),
             "sigma_depth_m": pa.array(sigma, mask=~np.isfinite(sigma)),
-            "reference_m": np.repeat(reference, count),
-            "reference_spread_m": np.repeat(spread, count).astype(np.float32),
+            "reference_m": np.repeat(reference.depth_m, count),
+            "reference_spread_m": np.repeat(reference.spread_m, count).astype(np.float32),
+            "reference_sigma_m": np.repeat(by_pose, count).astype(np.float32),
             "kept": scored.kept.ravel(),
         }
     )

@@ -64,7 +64,7 @@ baseline_m = [3.0, 16.0]
 matcher = "sift"
 
 [refine]
-mode = "none"
+mode = "flight"
 
 [depth]
 methods = ["epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"]

@@ -76,7 +76,7 @@ max_range_m = 12.0
 nearest_m = 1.0
 
 [refine]
-mode = "none"
+mode = "flight"
 
 [depth]
 methods = ["epitransfer", "dlt"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,17 @@ class FakeContext:
     executor: Executor = field(default_factory=SerialExecutor)
     written: dict[str, pa.Table] = field(default_factory=dict)
     recorded: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def setting(self, key: str) -> Any:
+        assert key in STAGE.reads
+
+    def facts(self, stage: str) -> Mapping[str, Any]:
+        assert stage in STAGE.facts_of
+        return {}
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
 
     def read(self, name: str) -> pa.Table:
         assert name in STAGE.inputs

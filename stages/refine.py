@@ -23,7 +23,7 @@ from pipeline.refinement.flight.stars import Stars, stars_by_ref
 from pipeline.refinement.logged import Log, as_logged, logged_frames
 from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
-from pipeline.refinement.pair import refine_pair, surest_frames
+from pipeline.refinement.pair import refine_pair, surest_frames, trusted
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
 from pipeline.refinement.surveyed import Survey, doubts, survey
 from pipeline.refinement.telling import facts_of, sentence
@@ -176,7 +176,8 @@ def sources(config: Config) -> tuple[Path | str, ...]:
 
 def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
     number = {name: i for i, name in enumerate(log.poses)}
-    return [one for file in files for one in stars_by_ref(_matched(log, file), number)]
+    agreeing = [[some for matched in _matched(log, file) if (some := trusted(log, matched))] for file in files]
+    return [one for of_file in agreeing for one in stars_by_ref(of_file, number)]
 
 
 def _matched(log: Log, file: Path) -> list[Matched]:

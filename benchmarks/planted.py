@@ -26,6 +26,8 @@ from pipeline.geometry.rotations import gimbal_angles
 
 POSITION, GIMBAL = ("east_m", "north_m", "up_m"), ("yaw_deg", "pitch_deg", "roll_deg")
 _BETWEEN = np.sqrt(2.0)
+YAW, CLOCK, LEVER = "boresight_yaw_rad", "clock_s", ("lever_forward_m", "lever_right_m", "lever_down_m")
+_CLOCK_SIGMA_S, _LEVER_SIGMA_M, _BIAS_HOLDS_S = 0.2, 0.1, 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,8 @@ class Case:
         common_yaw_deg: Sigma stated for all headings alike; nothing is drawn from it.
         boresight_yaw_deg: By how much all headings are wrong.
         clock_s: By how much the positions are too late.
+        drawn: Whether heading, clock, lever arm and a slowly drifting bias are drawn, too, as widely as docs/method.md
+            says that a log allows them.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Case:
     common_yaw_deg: float = 0.0
     boresight_yaw_deg: float = 0.0
     clock_s: float = 0.0
+    drawn: bool = False
 
     @property
     def own(self) -> PoseSigmas:
@@ -67,6 +72,7 @@ _A = ((0.1, 0.1, 0.1), (0.2, 0.2, 0.2))
 SHARED = (
     Case("e", "as a, and a heading 1 deg off, positions 0.2 s late", *_A, 0.5, 1.0, 1.0, 0.2),
     Case("f", "as e, with nothing planted", *_A, 0.5, 1.0),
+    Case("g", "as a, and heading, clock, lever arm and bias drawn", *_A, 0.5, 1.0, drawn=True),
 )
 CASES = (
     Case("a", "0.1 m, 0.2 deg between frames", *_A),
@@ -88,8 +94,20 @@ def velocities(truth: Mapping[str, TruePose], time_s: Mapping[str, float]) -> di
     return out
 
 
+def planted_errors(case: Case, rng: np.random.Generator) -> dict[str, float]:
+    """What all frames get wrong alike, by name; nothing is drawn unless the case says so."""
+    if not case.drawn:
+        return {YAW: float(np.radians(case.boresight_yaw_deg)), CLOCK: case.clock_s, **dict.fromkeys(LEVER, 0.0)}
+    sigma = (np.radians(case.common_yaw_deg), _CLOCK_SIGMA_S, *[_LEVER_SIGMA_M] * 3)
+    return dict(zip((YAW, CLOCK, *LEVER), (rng.normal(size=5) * sigma).tolist(), strict=True))
+
+
 def planted_poses(
-    truth: Mapping[str, TruePose], time_s: Mapping[str, float], case: Case, rng: np.random.Generator
+    truth: Mapping[str, TruePose],
+    time_s: Mapping[str, float],
+    case: Case,
+    shared: Mapping[str, float],
+    rng: np.random.Generator,
 ) -> dict[str, Pose]:
     """One draw of a case's log.
 
@@ -97,15 +115,28 @@ def planted_poses(
         truth: True poses by frame.
         time_s: Exposures by frame.
         case: What is wrong.
-        rng: Of the frames' own errors.
+        shared: As `planted_errors` gives it.
+        rng: Of the frames' own errors, and of a bias.
     """
     speed = velocities(truth, time_s)
-    boresight = np.radians([case.boresight_yaw_deg, 0.0, 0.0])
+    boresight, lever = np.array([shared[YAW], 0.0, 0.0]), np.array([shared[name] for name in LEVER])
+    bias = _bias(np.array([time_s[name] for name in truth]), case, rng) if case.drawn else np.zeros((len(truth), 3))
     out = {}
-    for name, true in truth.items():
-        shift = rng.normal(size=3) * case.own.position_m + speed[name] * case.clock_s
+    for name, true, drift in zip(truth, truth.values(), bias, strict=True):
+        shift = rng.normal(size=3) * case.own.position_m + speed[name] * shared[CLOCK]
         turn = rng.normal(size=3) * case.own.gimbal_rad + boresight
-        out[name] = Pose(turned(true.rotation, turn), true.centre + shift, case.own, case.common)
+        yaw = gimbal_angles(true.rotation)[0]
+        level = np.array([[np.sin(yaw), np.cos(yaw), 0.0], [np.cos(yaw), -np.sin(yaw), 0.0], [0.0, 0.0, -1.0]])
+        centre = true.centre + shift + lever @ level + drift
+        out[name] = Pose(turned(true.rotation, turn), centre, case.own, case.common)
+    return out
+
+
+def _bias(time_s: Floats, case: Case, rng: np.random.Generator) -> Floats:
+    """(n, 3) m: a stationary Gauss-Markov process."""
+    correlation = np.exp(-np.abs(time_s[:, None] - time_s) / _BIAS_HOLDS_S)
+    root = np.linalg.cholesky(correlation + 1e-12 * np.eye(len(time_s)))
+    out: Floats = case.common_m * root @ rng.normal(size=(len(time_s), 3))
     return out
 
 

@@ -2,7 +2,7 @@
 
 usage: python benchmarks/refined.py EXAMPLE WORK [CASES]
 
-EXAMPLE is a folder that `epitransfer example` made, WORK an empty or absent folder, CASES some of the letters abcdef.
+EXAMPLE is a folder that `epitransfer example` made, WORK an empty or absent folder, CASES some of the letters abcdefg.
 Every case is one seeded draw about the true poses; its `frames` state exactly the sigmas that it was drawn with. Pairs
 are chosen and photos matched under that log, then refined in every mode.
 """
@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from example_truth import MAX_RANGE_M, clipped, coded
 from flight_truth import LEGS, FlightTruth, configured, facts
-from planted import CASES, Case, planted_poses, planted_run
+from planted import CASES, CLOCK, YAW, Case, planted_errors, planted_poses, planted_run
 from redraws import squares_of, times_of
 
 from pipeline.engine.executors import usable_cores
@@ -77,6 +77,7 @@ class Outcome:
         off_m: (n,) m from the true place of what that photo shows.
         nees: (p,) squares of the pairs' relative pose errors in units of their covariances; 6 is to be expected.
         facts: Of the stage `refine`.
+        planted: What all frames get wrong alike, by name.
     """
 
     case: Case
@@ -86,6 +87,7 @@ class Outcome:
     off_m: Floats
     nees: Floats
     facts: dict[str, Any]
+    planted: dict[str, float]
 
 
 def command(*arguments: str | Path) -> None:
@@ -178,7 +180,8 @@ def pose_nees(run: Path, truth: FlightTruth) -> Floats:
 def outcomes(base: Path, case: Case, truth: FlightTruth, run: Path) -> Iterator[Outcome]:
     """Plants a case, and runs it in every mode."""
     rng = np.random.default_rng([SEED, ord(case.name)])
-    planted_run(base, planted_poses(truth.poses, times_of(base), case, rng), run)
+    shared = planted_errors(case, rng)
+    planted_run(base, planted_poses(truth.poses, times_of(base), case, shared, rng), run)
     for mode in MODES:
         first = "pair" if mode == MODES[0] else "refine"
         changed = ("--set", f'refine.mode="{mode}"', "--set", 'depth.methods=["epitransfer", "dlt"]')
@@ -190,6 +193,7 @@ def outcomes(base: Path, case: Case, truth: FlightTruth, run: Path) -> Iterator[
             *points_of(run, truth),
             pose_nees(run, truth),
             facts(run, "refine"),
+            shared,
         )
 
 
@@ -266,7 +270,10 @@ def shared(found: Sequence[Outcome]) -> Iterator[str]:
         if outcome.mode != "flight":
             continue
         for name, figures in outcome.facts["shared_errors"].items():
-            planted = {"boresight yaw": outcome.case.boresight_yaw_deg, "clock": outcome.case.clock_s}.get(name, 0.0)
+            known = outcome.planted
+            planted = {"boresight yaw": np.degrees(known[YAW]), "clock": known[CLOCK]}.get(
+                name, known.get(f"{name.replace('lever arm ', 'lever_')}_m", 0.0)
+            )
             # A correction undoes what was planted.
             value, sigma = -figures["correction"], figures["sigma"]
             said = f"{value:+10.4f} +- {sigma:.4f} {figures['unit']}"

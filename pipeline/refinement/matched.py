@@ -76,10 +76,13 @@ class Matched:
         """The same pixels through other lenses; the noise is kept, for these hardly change it."""
         return replace(self, rays=replace(self.rays, ref=ref.rays(self.ref_px), src=src.rays(self.src_px)))
 
+    def some(self, rows: Ints) -> Matched:
+        """Some of the matches."""
+        return replace(self, ref_px=self.ref_px[rows], src_px=self.src_px[rows], rays=self.rays.some(rows))
+
     def without_matches(self) -> Matched:
         """The pair alone."""
-        empty = np.empty((0, 3))
-        return replace(self, ref_px=empty[:, :2], src_px=empty[:, :2], rays=Rays(empty, empty, empty))
+        return self.some(np.empty(0, np.int64))
 
     def residuals_px(self, pose: RelativePose) -> Floats:
         """(n,) absolute epipolar residuals under a pose, as pixels of src."""

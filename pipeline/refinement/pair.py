@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,17 +25,18 @@ from pipeline.geometry.poses import (
     joint_covariance,
     relative_jacobian,
     relative_placement,
+    relative_pose,
 )
 from pipeline.refinement.logged import Log, as_logged
 from pipeline.refinement.matched import Matched, Rays, epipolar
-from pipeline.refinement.refusals import Refusal, refusal_after, refusal_before
-from pipeline.refinement.relative import CAUCHY_SCALE, Fits, Prior, fit, inverse, minimal_fits
+from pipeline.refinement.refusals import Refusal, agreeing, in_front, refusal_after, refusal_before
+from pipeline.refinement.relative import CAUCHY_SCALE, Prior, fit, follow, inverse, minimal_fits
 from pipeline.refinement.rows import PAIR, RefinedFrame, RefinedPair
 from pipeline.refinement.scatter import SHARED_PX, scatter_of
 from pipeline.refinement.starts import homography_errors
 
 # More matches hardly make a pose more certain, but every one costs.
-_MOST_MATCHES = 1000
+_MOST_MATCHES, _FOLLOWED_ON = 1000, 400
 _SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 96, 6, 300
 # Samples of few matches are followed to a pixel or so, not to a match's own twentieth.
 _SAMPLE_NOISE = 10.0
@@ -124,22 +125,43 @@ def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
     rng = np.random.default_rng(zlib.crc32(matched.pair.pair_id.encode()))
     rows = np.sort(rng.permutation(len(matched))[:_MOST_MATCHES])
     rays, prior = matched.rays.some(rows), Prior.of(pose)
-    starts = _starts(rays, prior, rng)
-    fits = fit(rays, prior, starts)
-    best = int(np.argmin(fits.cost))
-    scatter = _scatter(rays, matched.ref_px[rows], prior, fits.error[best], fits.information[best])
+    few = rays.some(np.sort(rng.permutation(len(rows))[:_FOLLOWED_ON]))
+    fits = fit(few, prior, _starts(few, prior, rng))
+    refusal_after(few, prior, fits)
+    best = fits.error[int(np.argmin(fits.cost))]
+    # A match that would lie behind the cameras is a wrong one, however well it fits the epipolar lines.
+    ahead = np.flatnonzero(in_front(rays, prior, best))
+    rays, ref_px = rays.some(ahead), matched.ref_px[rows[ahead]]
+    found = follow(rays, prior, best[None], np.zeros(1))
+    scatter = _scatter(rays, ref_px, prior, found.error[0], found.information[0])
     shared_rad = SHARED_PX / matched.focal_px
-    error, information = fits.error[best], _with_shared_turn(fits.information[best] / scatter, shared_rad)
-    refusal_after(rays, prior, fits, scatter)
+    error, information = found.error[0], _with_shared_turn(found.information[0] / scatter, shared_rad)
     moved = float(np.sqrt(error @ prior.information @ error))
     scale = 1.0
     if moved > FAR_SIGMAS:
         # The log's sigmas are too small for what happened: the factor that makes the distance an ordinary one.
         scale = moved**2 / 6.0
-        wide = Prior(prior.ref_from_src, prior.centre, prior.information / scale)
-        again: Fits = fit(rays, wide, error[None])
+        wide = replace(prior, information=prior.information / scale)
+        again = follow(rays, wide, error[None], np.zeros(1))
         error, information = again.error[0], _with_shared_turn(again.information[0] / scatter, shared_rad)
     return RelativeFit(error, information, scale, moved)
+
+
+def trusted(log: Log, matched: Matched) -> Matched | None:
+    """The matches of a pair that agree with one pose; None where too few do for any of them to be trusted.
+
+    Args:
+        log: The flight as logged.
+        matched: The pair's inliers.
+    """
+    pose = relative_pose(log.poses[matched.pair.ref], log.poses[matched.pair.src])
+    try:
+        found = relative_fit(matched, pose)
+    except Refusal as refusal:
+        # What two frames leave open the others may tell.
+        return None if refusal.doubtful else matched
+    agree = agreeing(epipolar(matched.rays, *Prior.of(pose).moved(found.error)))
+    return matched.some(np.flatnonzero(agree))
 
 
 def _starts(rays: Rays, prior: Prior, rng: np.random.Generator) -> Floats:

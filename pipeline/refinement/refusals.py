@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.poses import RelativePose
-from pipeline.refinement.matched import Matched, Rays, epipolar
+from pipeline.refinement.matched import Epipolar, Matched, Rays, epipolar
 from pipeline.refinement.relative import Fits, Prior, costs
 from pipeline.refinement.starts import homography
 
@@ -19,13 +19,24 @@ _LEAST_PARALLAX_SIGMAS, _LEAST_PARALLAX = 6.0, 1e-3
 _LEAST_AGREEING, _AGREE_SIGMAS, _AGREE = 0.3, 6.0, 5e-4
 _LEAST_IN_FRONT = 0.5
 # Twice the difference of cost below which a second pose is as good: e^-6 to one.
-_CLEARLY_BETTER = 12.0
+_CLEARLY_BETTER, _BY_CHANCE = 12.0, 6.0
 _APART_SIGMAS = 5.0
+# Of the logged baseline: the shortest that is thought of.
+_SHORTEST = 0.1
 _PLANE_SHARE = 0.9
 
 
 class Refusal(Exception):  # noqa: N818 - no error: a finding
-    """The matches do not determine the relative pose; the text says why."""
+    """The matches do not determine the relative pose; the text says why.
+
+    Args:
+        reason: For people.
+        doubtful: Whether the matches themselves are in doubt, and not only what they determine.
+    """
+
+    def __init__(self, reason: str, *, doubtful: bool = False) -> None:
+        super().__init__(reason)
+        self.doubtful = doubtful
 
 
 def refusal_before(matched: Matched, pose: RelativePose) -> None:
@@ -35,7 +46,7 @@ def refusal_before(matched: Matched, pose: RelativePose) -> None:
         Refusal: Too few matches, on a line, or without parallax.
     """
     if len(matched) < LEAST_MATCHES:
-        raise Refusal(f"too few matches: {len(matched)}, and {LEAST_MATCHES} are needed")
+        raise Refusal(f"too few matches: {len(matched)}, and {LEAST_MATCHES} are needed", doubtful=True)
     if _width(matched.rays.ref) < _LEAST_WIDTH:
         raise Refusal("the matches lie along a line")
     left = _left_by_a_turn(matched.rays)
@@ -46,14 +57,13 @@ def refusal_before(matched: Matched, pose: RelativePose) -> None:
         raise Refusal("the logged baseline is zero")
 
 
-def refusal_after(rays: Rays, prior: Prior, fits: Fits, scatter: float) -> None:
+def refusal_after(rays: Rays, prior: Prior, fits: Fits) -> None:
     """What can be seen once the matches were followed from several starts.
 
     Args:
         rays: The matches.
         prior: The logged relative pose.
         fits: From every start.
-        scatter: The factor by which the matches' information is too large.
 
     Raises:
         Refusal: Two poses explain the matches, few agree with the best, or it puts them behind the cameras.
@@ -61,34 +71,47 @@ def refusal_after(rays: Rays, prior: Prior, fits: Fits, scatter: float) -> None:
     best = int(np.argmin(fits.cost))
     error = fits.error[best]
     found = epipolar(rays, *prior.moved(error))
-    agree = np.abs(found.sine) <= np.maximum(_AGREE_SIGMAS * found.sigma, _AGREE)
+    agree = agreeing(found)
     if np.mean(agree) < _LEAST_AGREEING:
-        raise Refusal(f"only {np.mean(agree):.0%} of the matches agree with one pose")
-    ahead = np.mean(_in_front(rays, prior, error)[agree])
+        raise Refusal(f"only {np.mean(agree):.0%} of the matches agree with one pose", doubtful=True)
+    ahead = np.mean(in_front(rays, prior, error)[agree])
     if ahead < _LEAST_IN_FRONT:
-        raise Refusal(f"the pose that fits would have {1.0 - ahead:.0%} of the matches behind the cameras")
-    rival = _rival(rays, prior, fits, best, scatter)
+        raise Refusal(
+            f"the pose that fits would have {1.0 - ahead:.0%} of the matches behind the cameras", doubtful=True
+        )
+    rival = _rival(rays, prior, fits, best)
     if rival:
         _, on_plane = homography(rays, float(np.median(found.sigma)) * _AGREE_SIGMAS + _AGREE)
         flat = np.mean(on_plane) > _PLANE_SHARE
         raise Refusal("the matches lie on a plane that two poses explain" if flat else "two poses explain the matches")
 
 
-def _rival(rays: Rays, prior: Prior, fits: Fits, best: int, scatter: float) -> bool:
-    """Whether another minimum, clearly elsewhere, is as good and has the points in front."""
-    posterior = fits.information[best] / scatter + prior.information
-    away = fits.error - fits.error[best]
-    apart = np.sqrt(np.einsum("bi,ij,bj->b", away, posterior, away))
-    less = 2.0 * _scaled(rays, prior, fits.error, scatter)
-    for i in np.flatnonzero((apart > _APART_SIGMAS) & (less - less[best] < _CLEARLY_BETTER)):
-        if np.mean(_in_front(rays, prior, fits.error[i])) >= _LEAST_IN_FRONT:
-            return True
-    return False
+def agreeing(found: Epipolar) -> Bools:
+    """Which matches agree with a pose, by their residuals under it."""
+    out: Bools = np.abs(found.sine) <= np.maximum(_AGREE_SIGMAS * found.sigma, _AGREE)
+    return out
 
 
-def _scaled(rays: Rays, prior: Prior, error: Floats, scatter: float) -> Floats:
-    log = 0.5 * np.einsum("bi,ij,bj->b", error, prior.information, error)
-    out: Floats = (costs(rays, prior, error) - log) / scatter + log
+def _rival(rays: Rays, prior: Prior, fits: Fits, best: int) -> bool:
+    """Whether another pose, clearly elsewhere, is as good and has the points in front."""
+    # Residuals do not know on which side src is: a minimum with all points behind stands for one with them in front.
+    others = np.concatenate([fits.error, [_mirrored(prior, error) for error in fits.error]])
+    away = others - fits.error[best]
+    apart = np.sqrt(np.einsum("bi,ij,bj->b", away, fits.information[best] + prior.information, away))
+    less = 2.0 * (costs(rays, prior, others) - fits.cost[best])
+    # Two poses see different parts of the matches' noise: by chance alone their costs differ as the square root of n.
+    enough = _CLEARLY_BETTER + _BY_CHANCE * np.sqrt(len(rays.ref))
+    rivals = np.flatnonzero((apart > _APART_SIGMAS) & (less < enough))
+    return any(np.mean(in_front(rays, prior, others[i])) >= _LEAST_IN_FRONT for i in rivals)
+
+
+def _mirrored(prior: Prior, error: Floats) -> Floats:
+    """The error with src on the other side of ref, as far from it as the log finds likeliest."""
+    centre = prior.centre + error[3:]
+    way = np.concatenate([np.zeros(3), -centre / max(float(np.linalg.norm(centre)), 1e-9)])
+    here = np.concatenate([error[:3], -prior.centre])
+    length = -(way @ prior.information @ here) / (way @ prior.information @ way)
+    out: Floats = here + max(length, _SHORTEST * float(np.linalg.norm(prior.centre))) * way
     return out
 
 
@@ -112,7 +135,7 @@ def _left_by_a_turn(rays: Rays) -> float:
     return float(np.median(left))
 
 
-def _in_front(rays: Rays, prior: Prior, error: Floats) -> Floats:
+def in_front(rays: Rays, prior: Prior, error: Floats) -> Floats:
     """(n,) 1 where the point nearest to both rays is in front of both cameras."""
     ref_from_src, centre = prior.moved(error)
     src = rays.src @ ref_from_src.T

@@ -22,6 +22,7 @@ from pipeline.refinement.matched import Rays, epipolar
 
 # In sigmas. Sub-pixel positions are a little worse than Gaussian in their tails.
 CAUCHY_SCALE = 2.5
+_MOST_SAY = 3.0
 _MOST_STEPS = 30
 _SMALL = 1e-3
 _HALVING = 0.5
@@ -35,16 +36,19 @@ class Prior:
         ref_from_src: (3, 3).
         centre: (3,) m, src's in ref.
         information: (6, 6) inverse covariance of turn (rad) and shift (m) on ref's axes.
+        spread: (6, 6) sigmas of turn and shift on the diagonal: the units in which derivatives are compared.
     """
 
     ref_from_src: Floats
     centre: Floats
     information: Floats
+    spread: Floats
 
     @classmethod
     def of(cls, pose: RelativePose) -> Prior:
         """From a relative pose; what its covariance says nothing of is taken as certain."""
-        return cls(pose.rotation.T, pose.centre, inverse(pose.covariance))
+        spread = np.diag(np.sqrt(np.diag(pose.covariance)))
+        return cls(pose.rotation.T, pose.centre, inverse(pose.covariance), spread)
 
     def moved(self, error: Floats) -> tuple[Floats, Floats]:
         """ref_from_src (..., 3, 3) and src's centre (..., 3) after errors (..., 6)."""
@@ -76,23 +80,41 @@ def inverse(covariance: Floats) -> Floats:
 
 def costs(rays: Rays, prior: Prior, error: Floats) -> Floats:
     """(b,) the cost of errors (b, 6)."""
-    found = epipolar(rays, *prior.moved(error))
-    square = (found.sine / found.sigma) ** 2
+    square = _whitened(rays, prior, error)[0] ** 2
     data = 0.5 * CAUCHY_SCALE**2 * np.sum(np.log1p(square / CAUCHY_SCALE**2), axis=-1)
     out: Floats = data + 0.5 * np.einsum("...i,ij,...j->...", error, prior.information, error)
     return out
 
 
 def fit(rays: Rays, prior: Prior, starts: Floats) -> Fits:
-    """Iteratively reweighted Gauss-Newton, the robust scale narrowing from what each start leaves to the noise's.
+    """The minima that starts lead to, each followed in two ways.
+
+    Once the robust scale narrows from what the start leaves to the noise's, which forgives a start far off; once it is
+    the noise's from the beginning, which does not leave a good start when most matches are wrong.
 
     Args:
         rays: The matches.
         prior: The logged relative pose.
         starts: (b, 6) errors to start from.
+
+    Returns:
+        2 b of them.
+    """
+    left = 1.5 * np.median(np.abs(_whitened(rays, prior, starts)[0]), axis=-1)
+    return follow(rays, prior, np.concatenate([starts, starts]), np.concatenate([left, np.zeros(len(starts))]))
+
+
+def follow(rays: Rays, prior: Prior, starts: Floats, scale: Floats) -> Fits:
+    """Iteratively reweighted Gauss-Newton.
+
+    Args:
+        rays: The matches.
+        prior: The logged relative pose.
+        starts: (b, 6) errors to start from.
+        scale: (b,) robust scales to start with, in sigmas; they narrow to CAUCHY_SCALE.
     """
     error = starts.copy()
-    scale = np.maximum(CAUCHY_SCALE, 1.5 * np.median(np.abs(_whitened(rays, prior, error)[0]), axis=-1))
+    scale = np.maximum(CAUCHY_SCALE, scale)
     for _ in range(_MOST_STEPS):
         step, _, sigmas = _step(rays, prior, error, scale)
         error = composed(step, error)
@@ -131,7 +153,12 @@ def composed(step: Floats, error: Floats) -> Floats:
 
 def _whitened(rays: Rays, prior: Prior, error: Floats) -> tuple[Floats, Floats]:
     found = epipolar(rays, *prior.moved(error))
-    return found.sine / found.sigma, found.jacobian / found.sigma[..., None]
+    # A match next to the epipole, or one whose parallax is that of a thing before the lens, moves with the pose more
+    # than all others together: were it wrong, the pose would be what suits it. So none has more than a few times the
+    # say of a usual one.
+    say = np.linalg.norm(found.jacobian @ prior.spread, axis=-1) / found.sigma
+    sigma = found.sigma * np.maximum(1.0, say / (_MOST_SAY * np.median(say, axis=-1, keepdims=True)))
+    return found.sine / sigma, found.jacobian / sigma[..., None]
 
 
 def _step(rays: Rays, prior: Prior, error: Floats, scale: Floats) -> tuple[Floats, Floats, Floats]:

@@ -103,13 +103,10 @@ def accuracy(run: Path, truth: FlightTruth, sides: Mapping[str, Side]) -> Iterat
     frames = read_table(run / "frames.parquet", "frames")
     cameras = camera_by_frame(frames, cameras_of(read_table(run / "cameras.parquet", "cameras")))
     yield f"{'':36}{'with truth':>12}{'median':>10}{'AbsRel':>10}{'within 1 %':>12}"
-    kept = our_observations(run)
-    rows = {"epitransfer kept depths": errors(kept, truth, cameras)}
-    models = {name: colmap_observations(side.model, run) for name, side in sides.items()}
-    as_many = kept.surest(len(models[AS_GIVEN][0].depth_m))
-    rows["  surest, as many as COLMAP's"] = errors(as_many, truth, cameras)
+    rows = {"epitransfer kept depths": errors(our_observations(run), truth, cameras)}
     rows["epitransfer points"] = points_of(run, truth)[0]
-    for name, (observed, nearest) in models.items():
+    for name, side in sides.items():
+        observed, nearest = colmap_observations(side.model, run)
         rows[f"{name} observations"] = errors(observed, truth, cameras)
         rows[f"{name} points"] = errors(observed.where(nearest), truth, cameras)
     for name, error in rows.items():

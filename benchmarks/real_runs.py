@@ -156,19 +156,21 @@ def logged(run: Path) -> dict[str, Pose]:
     return poses_of(read_table(run / "frames.parquet", "frames"))
 
 
-def widened(some: PhotoSet, longest_m: float, overlap: float) -> Path:
-    """A set matched anew with more and longer pairs, and refined as a flight.
+def variant(some: PhotoSet, name: str, first: str, *changed: str) -> Path:
+    """A set's matched run, refined as a flight with settings changed.
 
     Args:
         some: The set.
-        longest_m: Longest baseline.
-        overlap: Least share of ref's ground that src sees.
+        name: Of the variant.
+        first: The first stage to run again.
+        changed: The settings.
     """
-    run = some.run.with_name(f"{some.run.name}.wide")
+    run = some.run.with_name(f"{some.run.name}.{name}")
     shutil.copytree(some.run, run)
-    changed = (f"pair.baseline_m=[2, {longest_m}]", f"pair.min_overlap={overlap}", 'refine.mode="flight"')
-    settings = [part for value in (*changed, 'depth.methods=["epitransfer"]') for part in ("--set", value)]
-    epitransfer(run, run / "workflow.toml", "--from", "pair", "--to", "depth", *settings)
+    settings = ('refine.mode="flight"', 'depth.methods=["epitransfer"]', *changed)
+    last = "score" if (run.with_name(f"{some.run.name}.flight") / "scores").is_dir() else "depth"
+    given = [part for value in settings for part in ("--set", value)]
+    epitransfer(run, run / "workflow.toml", "--from", first, "--to", last, *given)
     return run
 
 

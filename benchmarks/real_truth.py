@@ -66,10 +66,9 @@ class Depths:
 
 
 def cameras(run: Path) -> dict[str, Camera]:
-    """By frame, as given."""
-    return camera_by_frame(
-        read_table(run / "frames.parquet", "frames"), cameras_of(read_table(run / "cameras.parquet", "cameras"))
-    )
+    """By frame, as refined."""
+    known = cameras_of(read_table(run / "refined_cameras.parquet", "refined_cameras"))
+    return camera_by_frame(read_table(run / "frames.parquet", "frames"), known)
 
 
 def placed(run: Path) -> dict[str, Placement]:
@@ -84,7 +83,7 @@ def measured_depths(folder: Path, frame_id: AnyArray, ref_px: Floats) -> Floats:
         rows = np.flatnonzero(frame_id == name)
         stored = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         if stored is not None:
-            out[rows] = sampled(stored.astype(np.float64) / 1000.0, ref_px[rows])
+            out[rows] = sampled(np.where(stored > 0, stored / 1000.0, np.nan), ref_px[rows])
     return out
 
 
@@ -99,6 +98,16 @@ def _pose_error(found: RelativePose, true: RelativePose) -> tuple[float, float, 
     across = float(np.linalg.norm(np.cross(found.centre, true.centre)))
     direction = float(np.arctan2(across, float(found.centre @ true.centre)))
     return float(np.degrees(turn)), float(np.degrees(direction)), abs(length / true_length - 1.0)
+
+
+def unexplained(relative: Floats, sigma: Floats, share: float = 0.68) -> float:
+    """The relative error of the truth that, added in quadrature to the sigmas (n,), makes them cover that share."""
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        covered = float(np.mean(np.abs(relative) <= np.hypot(sigma, middle)))
+        low, high = (middle, high) if covered < share else (low, middle)
+    return high
 
 
 def squares(found: Sequence[RelativePose], exact: Sequence[RelativePose]) -> Floats:
@@ -198,6 +207,8 @@ def agreement(found: Depths, rows: Bools) -> tuple[int, float, float]:
     variance = np.bincount(pixel, (depth - mean[pixel]) ** 2) / np.maximum(n - 1, 1)
     promised = np.bincount(pixel, sigma**2) / n
     several = n > 1
+    if not np.any(several):
+        return 0, float("nan"), float("nan")
     spread = np.sqrt(variance[several])
     return (
         int(several.sum()),

@@ -18,12 +18,12 @@ from pipeline.engine.tables import parquet_files, read_table
 from pipeline.flight import camera_by_frame, cameras_of, column, poses_of, selected_pairs
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.refinement.flight.control import Control
-from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
-from pipeline.refinement.flight.stars import Stars, stars_by_ref
+from pipeline.refinement.flight.flight import RefinedFlight, refine_flight, trusted_stars
+from pipeline.refinement.flight.stars import Stars
 from pipeline.refinement.logged import Log, as_logged, logged_frames
 from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
-from pipeline.refinement.pair import refine_pair, surest_frames, trusted
+from pipeline.refinement.pair import refine_pair, surest_frames
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
 from pipeline.refinement.surveyed import Survey, doubts, survey
 from pipeline.refinement.telling import facts_of, sentence
@@ -175,9 +175,7 @@ def sources(config: Config) -> tuple[Path | str, ...]:
 
 
 def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
-    number = {name: i for i, name in enumerate(log.poses)}
-    agreeing = [[some for matched in _matched(log, file) if (some := trusted(log, matched))] for file in files]
-    return [one for of_file in agreeing for one in stars_by_ref(of_file, number)]
+    return [one for file in files for one in trusted_stars(log, _matched(log, file))]
 
 
 def _matched(log: Log, file: Path) -> list[Matched]:

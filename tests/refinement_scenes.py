@@ -13,8 +13,7 @@ from pipeline.geometry.arrays import Bools, Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement, Pose, PoseSigmas
 from pipeline.geometry.rotations import enu_from_cam, gimbal_error_axes, rotation_from_vector, vector_from_rotation
-from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
-from pipeline.refinement.flight.stars import stars_by_ref
+from pipeline.refinement.flight.flight import RefinedFlight, refine_flight, trusted_stars
 from pipeline.refinement.logged import Log
 from pipeline.refinement.matched import Matched
 from pipeline.refinement.near import together
@@ -185,8 +184,7 @@ def matches_by_pair(
 
 def refined_flight(log: Log, found: Sequence[Matched]) -> RefinedFlight:
     """As the stage refines it."""
-    number = {name: i for i, name in enumerate(log.poses)}
-    return refine_flight(log, stars_by_ref(found, number), together(tuple(log.poses), list(log.pairs.values())))
+    return refine_flight(log, trusted_stars(log, found), together(tuple(log.poses), list(log.pairs.values())))
 
 
 def off(found: Placement | Pose, truth: Placement) -> Floats:

@@ -41,6 +41,8 @@ _SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 96, 6, 300
 # Samples of few matches are followed to a pixel or so, not to a match's own twentieth.
 _SAMPLE_NOISE = 10.0
 _POLISHED = 4
+# What a gimbal that lies may be off by.
+_ANY_TURN_RAD = 0.2
 # A pose farther from the log than this many sigmas means that the log's sigmas are too small, or that it lies.
 FAR_SIGMAS = 6.0
 
@@ -156,12 +158,26 @@ def trusted(log: Log, matched: Matched) -> Matched | None:
     """
     pose = relative_pose(log.poses[matched.pair.ref], log.poses[matched.pair.src])
     try:
-        found = relative_fit(matched, pose)
+        return _agreeing_with_any(matched, pose, relative_fit(matched, pose).error[None])
     except Refusal as refusal:
-        # What two frames leave open the others may tell.
-        return None if refusal.doubtful else matched
-    agree = agreeing(epipolar(matched.rays, *Prior.of(pose).moved(found.error)))
-    return matched.some(np.flatnonzero(agree))
+        if not refusal.doubtful:
+            # What two frames leave open the others may tell.
+            return matched if refusal.errors is None else _agreeing_with_any(matched, pose, refusal.errors)
+    # Or the log is what is wrong: a receiver that jumped, a gimbal that lied. The matches then agree without it.
+    length = float(np.linalg.norm(pose.centre))
+    anywhere = replace(pose, covariance=np.diag([_ANY_TURN_RAD**2] * 3 + [length**2] * 3))
+    try:
+        found = relative_fit(matched, anywhere)
+    except Refusal:
+        return None
+    some = _agreeing_with_any(matched, anywhere, found.error[None])
+    return some if len(some) > 0.5 * len(matched) else None
+
+
+def _agreeing_with_any(matched: Matched, pose: RelativePose, errors: Floats) -> Matched:
+    """The matches that agree with one of several errors (k, 6) of a pose."""
+    found = epipolar(matched.rays, *Prior.of(pose).moved(errors))
+    return matched.some(np.flatnonzero(np.any(agreeing(found), axis=0)))
 
 
 def _starts(rays: Rays, prior: Prior, rng: np.random.Generator) -> Floats:

@@ -32,11 +32,13 @@ class Refusal(Exception):  # noqa: N818 - no error: a finding
     Args:
         reason: For people.
         doubtful: Whether the matches themselves are in doubt, and not only what they determine.
+        errors: (k, 6) of the logged pose that the matches cannot choose between.
     """
 
-    def __init__(self, reason: str, *, doubtful: bool = False) -> None:
+    def __init__(self, reason: str, *, doubtful: bool = False, errors: Floats | None = None) -> None:
         super().__init__(reason)
         self.doubtful = doubtful
+        self.errors = errors
 
 
 def refusal_before(matched: Matched, pose: RelativePose) -> None:
@@ -76,14 +78,13 @@ def refusal_after(rays: Rays, prior: Prior, fits: Fits) -> None:
         raise Refusal(f"only {np.mean(agree):.0%} of the matches agree with one pose", doubtful=True)
     ahead = np.mean(in_front(rays, prior, error)[agree])
     if ahead < _LEAST_IN_FRONT:
-        raise Refusal(
-            f"the pose that fits would have {1.0 - ahead:.0%} of the matches behind the cameras", doubtful=True
-        )
-    rival = _rival(rays, prior, fits, best)
-    if rival:
+        raise Refusal(f"the pose that fits would have {1.0 - ahead:.0%} of the matches behind the cameras")
+    rivals = _rivals(rays, prior, fits, best)
+    if len(rivals):
         _, on_plane = homography(rays, float(np.median(found.sigma)) * _AGREE_SIGMAS + _AGREE)
         flat = np.mean(on_plane) > _PLANE_SHARE
-        raise Refusal("the matches lie on a plane that two poses explain" if flat else "two poses explain the matches")
+        text = "the matches lie on a plane that two poses explain" if flat else "two poses explain the matches"
+        raise Refusal(text, errors=np.concatenate([fits.error[best][None], rivals]))
 
 
 def agreeing(found: Epipolar) -> Bools:
@@ -92,8 +93,8 @@ def agreeing(found: Epipolar) -> Bools:
     return out
 
 
-def _rival(rays: Rays, prior: Prior, fits: Fits, best: int) -> bool:
-    """Whether another pose, clearly elsewhere, is as good and has the points in front."""
+def _rivals(rays: Rays, prior: Prior, fits: Fits, best: int) -> Floats:
+    """(k, 6) errors clearly elsewhere that are as good and have the points in front."""
     # Residuals do not know on which side src is: a minimum with all points behind stands for one with them in front.
     others = np.concatenate([fits.error, [_mirrored(prior, error) for error in fits.error]])
     away = others - fits.error[best]
@@ -102,7 +103,9 @@ def _rival(rays: Rays, prior: Prior, fits: Fits, best: int) -> bool:
     # Two poses see different parts of the matches' noise: by chance alone their costs differ as the square root of n.
     enough = _CLEARLY_BETTER + _BY_CHANCE * np.sqrt(len(rays.ref))
     rivals = np.flatnonzero((apart > _APART_SIGMAS) & (less < enough))
-    return any(np.mean(in_front(rays, prior, others[i])) >= _LEAST_IN_FRONT for i in rivals)
+    ahead = [i for i in rivals if np.mean(in_front(rays, prior, others[i])) >= _LEAST_IN_FRONT]
+    out: Floats = others[ahead]
+    return out
 
 
 def _mirrored(prior: Prior, error: Floats) -> Floats:

@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.poses import RelativePose
 from pipeline.geometry.rotations import rotation_from_vector, vector_from_rotation
-from pipeline.refinement.matched import Rays, epipolar
+from pipeline.refinement.matched import Epipolar, Rays, epipolar
 
 # In sigmas. Sub-pixel positions are a little worse than Gaussian in their tails.
 CAUCHY_SCALE = 2.5
@@ -156,9 +156,15 @@ def _whitened(rays: Rays, prior: Prior, error: Floats) -> tuple[Floats, Floats]:
     # A match next to the epipole, or one whose parallax is that of a thing before the lens, moves with the pose more
     # than all others together: were it wrong, the pose would be what suits it. So none has more than a few times the
     # say of a usual one.
-    say = np.linalg.norm(found.jacobian @ prior.spread, axis=-1) / found.sigma
-    sigma = found.sigma * np.maximum(1.0, say / (_MOST_SAY * np.median(say, axis=-1, keepdims=True)))
+    sigma = bounded_sigma(found, prior)
     return found.sine / sigma, found.jacobian / sigma[..., None]
+
+
+def bounded_sigma(found: Epipolar, prior: Prior) -> Floats:
+    """(..., n) sigmas, widened for matches that would say more than a few times what the usual one does."""
+    say = np.linalg.norm(found.jacobian @ prior.spread, axis=-1) / found.sigma
+    out: Floats = found.sigma * np.maximum(1.0, say / (_MOST_SAY * np.median(say, axis=-1, keepdims=True)))
+    return out
 
 
 def _step(rays: Rays, prior: Prior, error: Floats, scale: Floats) -> tuple[Floats, Floats, Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +17,10 @@ from pipeline.refinement.flight.graph import Covariances
 from pipeline.refinement.flight.lens import NAMES, Lenses
 from pipeline.refinement.flight.problem import FAR_SIGMAS, Problem, State
 from pipeline.refinement.flight.shared import shared_unknowns
-from pipeline.refinement.flight.stars import Stars
-from pipeline.refinement.logged import NO_INLIER, Log
+from pipeline.refinement.flight.stars import Stars, stars_by_ref
+from pipeline.refinement.logged import NO_INLIER, Log, logged_frames
 from pipeline.refinement.matched import Matched
+from pipeline.refinement.pair import trusted
 from pipeline.refinement.relative import inverse
 from pipeline.refinement.rows import FLIGHT, RefinedFrame, RefinedPair
 from pipeline.refinement.scatter import SHARED_PX, scatter_between
@@ -91,6 +92,17 @@ class RefinedFlight:
         return matched if cameras == given else matched.through(*cameras)
 
 
+def trusted_stars(log: Log, matched: Iterable[Matched]) -> list[Stars]:
+    """The stars of several pairs, of those matches of each that agree with one another.
+
+    Args:
+        log: The flight as logged; its frames are numbered in the order of its poses.
+        matched: The pairs' inliers, those of one ref frame among them all.
+    """
+    number = {name: i for i, name in enumerate(log.poses)}
+    return stars_by_ref([some for one in matched if (some := trusted(log, one))], number)
+
+
 def refine_flight(
     log: Log,
     stars: Sequence[Stars],
@@ -108,6 +120,9 @@ def refine_flight(
         calibrate: Whether the lenses are unknown, too; what the images do not determine of them stays as given.
         control: Surveyed points in its photos.
     """
+    if not stars and not control:
+        errors = PoseErrors.of_log(log.poses, near)
+        return RefinedFlight(logged_frames(log), errors, dict(log.cameras), (), 1.0, ())
     names, poses = list(log.poses), list(log.poses.values())
     lenses = Lenses.of([log.cameras[name] for name in names], unknown=calibrate)
     shared = shared_unknowns(poses, np.array([log.time_s[name] for name in names]))

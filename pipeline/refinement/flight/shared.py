@@ -25,6 +25,8 @@ CLOCK = "clock_s"
 LEVER = ("lever_forward_m", "lever_right_m", "lever_down_m")
 _CLOCK_SIGMA_S = 0.2
 _LEVER_SIGMA_M = 0.1
+# Of the log's level sigma: how much of it a clock or a lever arm may be, and of its square what the bias is at least.
+_CLOCK_SHARE, _LEVER_SHARE, _BIAS_SHARE = 0.7, 0.3, 0.3
 # A receiver's error changes over an hour; within a minute it moves by a fifth of its sigma.
 _BIAS_HOLDS_S = 3600.0
 _KNOT_EVERY_S = 60.0
@@ -78,8 +80,8 @@ def shared_unknowns(poses: Sequence[Pose], time_s: Floats) -> Shared:
     whole_m = np.hypot(common_m, np.median([pose.own.position_m for pose in poses], axis=0))
     level_m = float(np.sqrt(np.mean(whole_m[:2] ** 2)))
     speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=1))))
-    clock_s = min(_CLOCK_SIGMA_S, level_m / speed) if speed > 0.0 else 0.0
-    sigma = np.array([*common_rad, clock_s, *[min(_LEVER_SIGMA_M, level_m)] * 3])
+    clock_s = min(_CLOCK_SIGMA_S, _CLOCK_SHARE * level_m / speed) if speed > 0.0 else 0.0
+    sigma = np.array([*common_rad, clock_s, *[min(_LEVER_SIGMA_M, _LEVER_SHARE * level_m)] * 3])
     effect = np.zeros((len(poses), 6, len(sigma)))
     for i, pose in enumerate(poses):
         effect[i, :3, :3] = pose.error_axes
@@ -89,8 +91,11 @@ def shared_unknowns(poses: Sequence[Pose], time_s: Floats) -> Shared:
     used = sigma > _NONE
     knot_s = _knots(time_s)
     before, share = _between(time_s, knot_s)
+    # Together they are to be what the log says of a whole position, not more.
+    told = np.mean(np.sum((effect[:, 3:] * sigma) ** 2, axis=2), axis=0)
+    bias_m = np.sqrt(np.maximum(common_m**2 - told, _BIAS_SHARE * common_m**2))
     return Shared(
-        tuple(names[used].tolist()), sigma[used], effect[:, :, used], knot_s, common_m, before, share, clock_s * rest
+        tuple(names[used].tolist()), sigma[used], effect[:, :, used], knot_s, bias_m, before, share, clock_s * rest
     )
 
 

@@ -122,7 +122,7 @@ def run(config: Config, context: Context) -> str:
     cameras = log.cameras if flight is None else flight.cameras
     context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
-    for doubt in doubts(flight, log):
+    for doubt in doubts(flight, log, config.control_sigma_m, str(config.control_points)):
         context.warn(doubt)
     for name, value in facts.items():
         context.record(name, value)

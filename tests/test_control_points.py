@@ -475,7 +475,7 @@ def test_control_points_remove_what_all_frames_get_wrong_alike() -> None:
     assert (facts["points"], facts["observations"], facts["observations_out_of_sight"]) == (5, 25, 0)
     assert 30.0 < facts["rms_before_px"] < 120.0
     assert 0.7 < facts["rms_after_px"] < 3.5
-    assert not doubts(flight.found, flight.log)
+    assert not doubts(flight.found, flight.log, 0.05, "")
 
 
 def test_the_more_points_the_less_is_left_open() -> None:
@@ -506,18 +506,18 @@ def test_one_wrong_point_among_five_loses_its_say(how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["pixels swapped", "points permuted"])
-def test_points_that_do_not_fit_are_doubted(how: str) -> None:
+def test_points_that_do_not_fit_are_refused(how: str) -> None:
     flight = held(3, 5, PLANTED, how)
-    said = doubts(flight.found, flight.log)
     worst = max(flight.found.control, key=lambda fit: float(np.median(fit.after_px)))
-    assert said
-    assert "do not fit the photos" in said[0]
-    assert worst.name in said[0]
+    with pytest.raises(InputError, match=rf"E-CONTROL-14(.|\n)*{worst.name}"):
+        doubts(flight.found, flight.log, 0.05, "gcp_list.txt")
+    # Points of a map may be off by so much.
+    assert all("do not fit" not in said for said in doubts(flight.found, flight.log, 20.0, "gcp_list.txt"))
 
 
 def test_a_flight_that_control_moves_by_more_than_its_log_allows_is_doubted() -> None:
     flight = held(4, 5, PLANTED + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 33.0]))
-    (said,) = doubts(flight.found, flight.log)
+    (said,) = doubts(flight.found, flight.log, 0.05, "")
     assert "CRS and height datum" in said
     assert "-3" in said.split("m up")[0]
 

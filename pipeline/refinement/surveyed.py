@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.engine.errors import NothingLeftError, UndeterminedError
+from pipeline.engine.errors import InputError, NothingLeftError, UndeterminedError
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.geometry.arrays import Floats
@@ -21,6 +21,8 @@ from pipeline.sources.control_points import ControlList, load_control_points
 _KEY = "refine.control_height_datum"
 # A mark that is clicked in its own photo is off by a few pixels at most.
 _WRONG_PX = 20.0
+# Coordinates that are worse than this may look wrong in a photo and be right.
+_SURVEYED_M = 0.2
 _FAR_SIGMAS = 5.0
 
 
@@ -114,20 +116,33 @@ def control_facts(fits: Sequence[ControlFit]) -> dict[str, Any]:
     }
 
 
-def doubts(flight: RefinedFlight | None, log: Log) -> list[str]:
-    """What a careful user wants to hear of the control points before believing the result."""
+def doubts(flight: RefinedFlight | None, log: Log, sigma_m: float, where: str) -> list[str]:
+    """What a careful user wants to hear of the control points before believing the result.
+
+    Args:
+        flight: The refined flight.
+        log: As logged.
+        sigma_m: Of the surveyed coordinates.
+        where: The list, named in errors.
+
+    Raises:
+        InputError: The points do not fit the photos, and would have bent the flight.
+    """
     told: list[str] = []
     if flight is None or not flight.control:
         return told
     after = np.concatenate([fit.after_px for fit in flight.control])
-    if np.median(after) > _WRONG_PX:
+    if np.median(after) > _WRONG_PX * max(1.0, sigma_m / _SURVEYED_M):
         worst = max(flight.control, key=lambda fit: float(np.median(fit.after_px)))
         off = float(np.median(worst.after_px))
         said = f"{off:.0f} px" if np.isfinite(off) else "out of sight"
-        told.append(
-            f"the control points do not fit the photos: half of them are more than {np.median(after):.0f} px off, "
-            f"{worst.name} most ({said}); see that images, column and row, and the height datum are right"
-        )
+        raise InputError(
+            "E-CONTROL-14", "the control points do not fit the photos", where=where,
+            found=f"half of them are more than {np.median(after):.0f} px off, {worst.name} most ({said})",
+            expected=f"less than {_WRONG_PX:g} px once the flight is fitted to them",
+            hint="see that images, column and row, CRS and height datum are right; for points of a map, whose "
+            "coordinates are not good to centimetres, state --set refine.control_sigma_m=1",
+        )  # fmt: skip
     shift = np.mean([flight.frames[name].placed.centre - pose.centre for name, pose in log.poses.items()], axis=0)
     allowed = np.median([np.hypot(p.common.position_m, p.own.position_m) for p in log.poses.values()], axis=0)
     if np.any(np.abs(shift) > _FAR_SIGMAS * allowed):

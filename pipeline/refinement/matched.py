@@ -118,17 +118,25 @@ def epipolar(rays: Rays, ref_from_src: Floats, centre: Floats) -> Epipolar:
     """
     unit = rays.src / np.linalg.norm(rays.src, axis=-1, keepdims=True)
     turned = unit @ np.swapaxes(ref_from_src, -1, -2)
-    plane = np.cross(centre[..., None, :], rays.ref)
+    plane = _cross(centre[..., None, :], rays.ref)
     length = np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-12)
     plane = plane / length
     sine = np.sum(plane * turned, axis=-1)
-    by_shift = (np.cross(rays.ref, turned) - sine[..., None] * np.cross(rays.ref, plane)) / length
+    by_shift = (_cross(rays.ref, turned) - sine[..., None] * _cross(rays.ref, plane)) / length
     in_src = plane @ ref_from_src
     across = (in_src - sine[..., None] * unit)[..., :2] * unit[..., 2:]
     xx, xy, yy = np.moveaxis(rays.noise, -1, 0)
     variance = across[..., 0] * (across[..., 0] * xx + 2.0 * across[..., 1] * xy) + across[..., 1] ** 2 * yy
-    jacobian = np.concatenate([np.cross(turned, plane), by_shift], axis=-1)
+    jacobian = np.concatenate([_cross(turned, plane), by_shift], axis=-1)
     return Epipolar(sine, np.sqrt(np.maximum(variance, 1e-24)), jacobian)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """(..., 3) cross products; numpy's own takes several times as long for many small ones."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    out: Floats = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    return out
 
 
 def by_pair(matches: pa.Table) -> Iterator[tuple[str, pa.Table]]:

@@ -36,11 +36,11 @@ from pipeline.refinement.scatter import SHARED_PX, scatter_of
 from pipeline.refinement.starts import homography_errors
 
 # More matches hardly make a pose more certain, but every one costs.
-_MOST_MATCHES, _FOLLOWED_ON = 1000, 400
-_SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 96, 6, 300
+_MOST_MATCHES, _FOLLOWED_ON = 1000, 300
+_SAMPLES, _SAMPLE_SIZE, _SCORED_ON = 64, 6, 200
 # Samples of few matches are followed to a pixel or so, not to a match's own twentieth.
 _SAMPLE_NOISE = 10.0
-_POLISHED = 4
+_POLISHED = 3
 # What a gimbal that lies may be off by.
 _ANY_TURN_RAD = 0.2
 # A pose farther from the log than this many sigmas means that the log's sigmas are too small, or that it lies.

@@ -132,10 +132,11 @@ def residuals(found: list[Told]) -> Iterator[str]:
         for mode, (known, depths) in runs.items():
             before, after = known["median_epipolar_residual_px"], known["median_epipolar_residual_after_px"]
             several, spread, _ = agreement(depths, everywhere)
+            said = f"{spread:.3%}" if several else "-"
             yield (
                 f"{one.photos.name if mode == MODES[0] else '':19}{mode:7}{before:10.3f}{after:8.3f}"
                 f"{len(pairs_of(one.photos.run)):7}{known['share_of_pairs_refined']:8.0%}"
-                f"{depths.kept.sum():7,}/{len(depths.kept):6,}{several:12,}{spread:9.3%}"
+                f"{depths.kept.sum():7,}/{len(depths.kept):6,}{several:12,}{said:>9}"
             )
     yield "Spread: of the depths that several pairs give one pixel, median, on the pixels kept in all modes."
 
@@ -254,10 +255,10 @@ def _cells(errors: Errors, draws: int) -> str:
     turn, direction, length = np.median(errors.poses, axis=0) if len(errors.poses) else (np.nan,) * 3
     nees = f"{np.median(errors.squares):8.1f}" if errors.squares.size else f"{'-':>8}"
     size, sigma = np.abs(errors.relative), errors.sigma
+    out = f"{turn:9.3f}{direction:9.2f}" + (f"{length:8.2%}" if np.isfinite(length) else f"{'-':>8}") + nees
     if not size.size:
-        return f"{turn:9.3f}{direction:9.2f}{length:8.2%}{nees}{'-':>8}"
-    out = f"{turn:9.3f}{direction:9.2f}{length:8.2%}{nees}{size.size / draws:8,.0f}{np.median(size):8.2%}"
-    out += f"{np.mean(size):8.2%}"
+        return f"{out}{'-':>8}"
+    out += f"{size.size / draws:8,.0f}{np.median(size):8.2%}{np.mean(size):8.2%}"
     out += f"{np.mean(np.abs(errors.common)):8.2%}" if errors.common.size else f"{'-':>8}"
     out += f"{np.median(errors.relative):+8.2%}"
     if sigma.size:
@@ -308,8 +309,7 @@ def main(work: Path, seeds: int) -> None:
             print(one)
         else:
             found.append(one)
-    print("Real photo sets in every mode of refinement\n")
-    _print("", residuals(found))
+    _print("Real photo sets in every mode of refinement", residuals(found))
     _print("What refine.mode = flight finds, and what it leaves", corrections(found))
     print("\nAgainst exact poses; depths against measured maps (hololens), or the same matches under exact poses")
     print(HEAD)

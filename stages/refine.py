@@ -26,7 +26,7 @@ from pipeline.refinement.near import together
 from pipeline.refinement.pair import refine_pair, surest_frames
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
 from pipeline.refinement.surveyed import Survey, doubts, survey
-from pipeline.refinement.telling import facts_of, sentence
+from pipeline.refinement.telling import facts_of, sentence, warnings_of
 from pipeline.sources.files import is_url
 from schemas import MATCHES, RELATIVE_POSES
 
@@ -122,7 +122,7 @@ def run(config: Config, context: Context) -> str:
     cameras = log.cameras if flight is None else flight.cameras
     context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
-    for doubt in doubts(flight, log, config.control_sigma_m, str(config.control_points)):
+    for doubt in (*doubts(flight, log, config.control_sigma_m, str(config.control_points)), *warnings_of(facts)):
         context.warn(doubt)
     for name, value in facts.items():
         context.record(name, value)

@@ -129,13 +129,13 @@ def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
     rays, prior = matched.rays.some(rows), Prior.of(pose)
     few = rays.some(np.sort(rng.permutation(len(rows))[:_FOLLOWED_ON]))
     fits = fit(few, prior, _starts(few, prior, rng))
-    refusal_after(few, prior, fits)
+    split = refusal_after(few, prior, fits)
     best = fits.error[int(np.argmin(fits.cost))]
     # A match that would lie behind the cameras is a wrong one, however well it fits the epipolar lines.
     ahead = np.flatnonzero(in_front(rays, prior, best))
     rays, ref_px = rays.some(ahead), matched.ref_px[rows[ahead]]
     found = follow(rays, prior, best[None], np.zeros(1))
-    scatter = _scatter(rays, ref_px, prior, found.error[0], found.information[0])
+    scatter = max(split, _scatter(rays, ref_px, prior, found.error[0], found.information[0]))
     shared_rad = SHARED_PX / matched.focal_px
     error, information = found.error[0], _with_shared_turn(found.information[0] / scatter, shared_rad)
     moved = float(np.sqrt(error @ prior.information @ error))

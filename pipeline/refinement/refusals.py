@@ -21,6 +21,9 @@ _LEAST_IN_FRONT = 0.5
 # Twice the difference of cost below which a second pose is as good: e^-6 to one.
 _CLEARLY_BETTER, _BY_CHANCE = 12.0, 6.0
 _APART_SIGMAS = 5.0
+# Minima that are nearer than this, as turns and as shares of the baseline, are one pose that a lens or a few moving
+# things have split; its sigmas can cover them.
+_NEAR_RAD, _NEAR = 3e-3, 0.03
 # Of the logged baseline: the shortest that is thought of.
 _SHORTEST = 0.1
 _PLANE_SHARE = 0.9
@@ -59,13 +62,16 @@ def refusal_before(matched: Matched, pose: RelativePose) -> None:
         raise Refusal("the logged baseline is zero")
 
 
-def refusal_after(rays: Rays, prior: Prior, fits: Fits) -> None:
+def refusal_after(rays: Rays, prior: Prior, fits: Fits) -> float:
     """What can be seen once the matches were followed from several starts.
 
     Args:
         rays: The matches.
         prior: The logged relative pose.
         fits: From every start.
+
+    Returns:
+        The factor that the matches' information has to be divided by to cover other minima next to the best one.
 
     Raises:
         Refusal: Two poses explain the matches, few agree with the best, or it puts them behind the cameras.
@@ -79,12 +85,16 @@ def refusal_after(rays: Rays, prior: Prior, fits: Fits) -> None:
     ahead = np.mean(in_front(rays, prior, error)[agree])
     if ahead < _LEAST_IN_FRONT:
         raise Refusal(f"the pose that fits would have {1.0 - ahead:.0%} of the matches behind the cameras")
-    rivals = _rivals(rays, prior, fits, best)
-    if len(rivals):
+    rivals, apart = _rivals(rays, prior, fits, best)
+    away = rivals - fits.error[best]
+    far = np.linalg.norm(away[:, :3], axis=1) > _NEAR_RAD
+    far |= np.linalg.norm(away[:, 3:], axis=1) > _NEAR * np.linalg.norm(prior.centre + fits.error[best, 3:])
+    if np.any(far):
         _, on_plane = homography(rays, float(np.median(found.sigma)) * _AGREE_SIGMAS + _AGREE)
         flat = np.mean(on_plane) > _PLANE_SHARE
         text = "the matches lie on a plane that two poses explain" if flat else "two poses explain the matches"
-        raise Refusal(text, errors=np.concatenate([fits.error[best][None], rivals]))
+        raise Refusal(text, errors=np.concatenate([fits.error[best][None], rivals[far]]))
+    return max(1.0, float(np.max(apart, initial=0.0)) ** 2 / 2.0)
 
 
 def agreeing(found: Epipolar) -> Bools:
@@ -93,8 +103,8 @@ def agreeing(found: Epipolar) -> Bools:
     return out
 
 
-def _rivals(rays: Rays, prior: Prior, fits: Fits, best: int) -> Floats:
-    """(k, 6) errors clearly elsewhere that are as good and have the points in front."""
+def _rivals(rays: Rays, prior: Prior, fits: Fits, best: int) -> tuple[Floats, Floats]:
+    """(k, 6) other errors that are as good and have the points in front, and (k,) how far they are in sigmas."""
     # Residuals do not know on which side src is: a minimum with all points behind stands for one with them in front.
     others = np.concatenate([fits.error, [_mirrored(prior, error) for error in fits.error]])
     away = others - fits.error[best]
@@ -104,8 +114,7 @@ def _rivals(rays: Rays, prior: Prior, fits: Fits, best: int) -> Floats:
     enough = _CLEARLY_BETTER + _BY_CHANCE * np.sqrt(len(rays.ref))
     rivals = np.flatnonzero((apart > _APART_SIGMAS) & (less < enough))
     ahead = [i for i in rivals if np.mean(in_front(rays, prior, others[i])) >= _LEAST_IN_FRONT]
-    out: Floats = others[ahead]
-    return out
+    return others[ahead], apart[ahead]
 
 
 def _mirrored(prior: Prior, error: Floats) -> Floats:

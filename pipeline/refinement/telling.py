@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from pipeline.engine.progress import counted
 from pipeline.refinement.flight.flight import Found, RefinedFlight
 from pipeline.refinement.rows import FLIGHT, NONE, RefinedPair
 from pipeline.refinement.surveyed import control_facts
@@ -44,7 +45,9 @@ def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict
         "pairs_not_refined": dict(sorted(reasons.items())),
     }
     if flight is not None:
-        out["shared_errors"] = {_WORDS[found.name][0]: _figures(found) for found in flight.found}
+        out["shared_errors"] = dict(_named(flight.found))
+        out["lens_as_given"] = list(flight.lens_as_given)
+        out["parts"] = flight.parts
         out["frames_refined"] = sum(frame.refined for frame in flight.frames.values())
         out["frames_off_the_log"] = {name: frame.problem for name, frame in flight.frames.items() if frame.problem}
         out["information_divided_by"] = round(flight.scatter, 3)
@@ -77,6 +80,35 @@ def sentence(pairs: str, mode: str, facts: Mapping[str, Any]) -> str:
         if f["sigma"] < _TOLD * f["prior_sigma"]
     ]
     return f"{said}; corrects {', '.join(told)}" if told else said
+
+
+def warnings_of(facts: Mapping[str, Any]) -> list[str]:
+    """What to distrust of a refined flight.
+
+    Args:
+        facts: As `facts_of` has them.
+    """
+    told = []
+    if facts.get("parts", 0) > 1:
+        told.append(
+            f"the flight falls into {facts['parts']} parts that no pair ties together, so they may lie as far from one "
+            "another as the log is off; a larger pair.baseline_m or a smaller pair.min_overlap lets more pairs in"
+        )
+    if off := facts.get("frames_off_the_log"):
+        name, why = next(iter(off.items()))
+        told.append(f"{counted(len(off), 'frame')} off the log, {name} among them: {why}")
+    if left := facts.get("lens_as_given"):
+        told.append(f"of the lens {', '.join(left)} stay as given: the images do not determine them")
+    return told
+
+
+def _named(found: Sequence[Found]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Figures by names for people; where several cameras have a parameter each, they are counted."""
+    seen: Counter[str] = Counter()
+    for one in found:
+        seen[one.name] += 1
+        words = _WORDS[one.name][0]
+        yield (words if seen[one.name] == 1 else f"{words}, camera {seen[one.name]}"), _figures(one)
 
 
 def _px(rms: float | None) -> str:

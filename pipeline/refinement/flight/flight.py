@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
@@ -54,6 +56,8 @@ class RefinedFlight:
         found: The shared unknowns.
         scatter: Factor by which the matches' information was too large.
         control: How the control points fit.
+        lens_as_given: Parameters of lenses that were looked for and are not determined.
+        parts: Sets of frames that no pair ties together, those without any match left out.
     """
 
     frames: dict[str, RefinedFrame]
@@ -62,6 +66,8 @@ class RefinedFlight:
     found: tuple[Found, ...]
     scatter: float
     control: tuple[ControlFit, ...] = ()
+    lens_as_given: tuple[str, ...] = ()
+    parts: int = 0
 
     def pair(self, log: Log, matched: Matched) -> RefinedPair:
         """A pair as the flight places it.
@@ -128,9 +134,11 @@ def refine_flight(
     shared = shared_unknowns(poses, np.array([log.time_s[name] for name in names]))
     problem = Problem(poses, shared, lenses, stars, control)
     state, covariances, scatter = _solved(problem)
+    left: tuple[str, ...] = ()
     if calibrate:
-        lenses = lenses.observed(_lens_sigma(problem, covariances))
+        lenses = lenses.observed(state.lens, _lens_sigma(problem, covariances))
         problem = replace(problem, lenses=lenses)
+        left = tuple(NAMES[k % len(NAMES)] for k in np.flatnonzero(lenses.sigma == 0.0))
         state, covariances, scatter = _solved(problem)
     errors = _errors(names, near, covariances, [SHARED_PX / log.cameras[name].focal_px for name in names])
     seen = [*(one.frames for one in stars), *(one.frames for one in control)]
@@ -144,7 +152,7 @@ def refine_flight(
     cameras = {name: now[lenses.of_frame[i]] for i, name in enumerate(names)}
     found = (*_found(problem, state, covariances), *_found_of_lenses(problem, state, covariances))
     fits = _fits(problem, state, [*cameras.values()])
-    return RefinedFlight(frames, errors, cameras, found, scatter, fits)
+    return RefinedFlight(frames, errors, cameras, found, scatter, fits, left, _parts(stars, len(names)))
 
 
 def _solved(problem: Problem) -> tuple[State, Covariances, float]:
@@ -152,6 +160,17 @@ def _solved(problem: Problem) -> tuple[State, Covariances, float]:
     found = [scatter_between(quadratic.by_cell, quadratic.information) for quadratic in quadratics]
     scatter = max(1.0, float(np.mean(found))) if found else 1.0
     return state, problem.final(state, quadratics, scatter), scatter
+
+
+def _parts(stars: Sequence[Stars], frames: int) -> int:
+    """Sets of frames that stars tie together; frames without any are not counted."""
+    links = [(int(one.frames[0]), int(other)) for one in stars for other in one.frames[1:]]
+    if not links:
+        return 0
+    ends = np.array(links)
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(frames, frames))
+    _, part = connected_components(graph, directed=False)
+    return len(np.unique(part[np.unique(ends)]))
 
 
 def _lens_sigma(problem: Problem, covariances: Covariances) -> Floats:

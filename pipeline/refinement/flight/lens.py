@@ -17,6 +17,7 @@ PRIOR_SIGMA: Floats = np.array([0.02, 0.05, 0.05])
 _STEP = 1e-5
 # With less than this taken off the prior's sigma, what was found is mostly the prior.
 _OBSERVED = 0.3
+_FAR = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +70,17 @@ class Lenses:
         each = zip(self.cameras, change.reshape(-1, len(NAMES)), strict=True)
         return tuple(changed(camera, of_one) for camera, of_one in each)
 
-    def observed(self, sigma: Floats) -> Lenses:
-        """With only those unknown that the images determine, by their posterior sigmas (3 c,)."""
-        return replace(self, sigma=np.where(sigma < _OBSERVED * self.sigma, self.sigma, 0.0))
+    def observed(self, change: Floats, sigma: Floats) -> Lenses:
+        """With only those unknown that the images determine and a lens may have.
+
+        Args:
+            change: (3 c,) as found.
+            sigma: (3 c,) posterior sigmas.
+        """
+        keep = sigma < _OBSERVED * self.sigma
+        # What is found far from anything a lens is off by stands for something else: a principal point, a shutter.
+        odd = (np.abs(change) > _FAR * self.sigma).reshape(-1, len(NAMES)).any(axis=1)
+        return replace(self, sigma=np.where(keep & ~np.repeat(odd, len(NAMES)), self.sigma, 0.0))
 
     def rays(self, stars: Stars, change: Floats) -> Stars:
         """The stars as changed lenses see them."""

@@ -14,7 +14,7 @@ from pipeline.refinement.flight import control as surveyed
 from pipeline.refinement.flight.control import Control
 from pipeline.refinement.flight.elimination import Quadratic, eliminated, inverse_depths
 from pipeline.refinement.flight.graph import Covariances, Graph
-from pipeline.refinement.flight.lens import Lenses
+from pipeline.refinement.flight.lens import LensChange, Lenses
 from pipeline.refinement.flight.shared import Shared
 from pipeline.refinement.flight.stars import Stars
 
@@ -38,6 +38,7 @@ class State:
         bias: (k, 3) of the knots.
         lens: (3 c,) changes of the lenses.
         depths: Inverse depths of each ref frame's stars.
+        by_lens: How each ref frame's stars change with the lenses as given; that hardly depends on what is found.
         points: (3,) of each control point, ENU m.
     """
 
@@ -46,6 +47,7 @@ class State:
     bias: Floats
     lens: Floats
     depths: list[Floats | None]
+    by_lens: list[LensChange | None]
     points: list[Floats]
 
 
@@ -72,7 +74,9 @@ class Problem:
         placed = [Placement(pose.rotation, pose.centre) for pose in self.logged]
         knots, lens = np.zeros((len(self.shared.knot_s), 3)), np.zeros(len(self.lenses.sigma))
         points = [one.surveyed_m for one in self.control]
-        return State(placed, np.zeros(len(self.shared.sigma)), knots, lens, [None] * len(self.stars), points)
+        depths: list[Floats | None] = [None] * len(self.stars)
+        by_lens = [self.lenses.derivatives(stars, lens) for stars in self.stars]
+        return State(placed, np.zeros(len(self.shared.sigma)), knots, lens, depths, by_lens, points)
 
     def off_log(self, state: State) -> Floats:
         """(n, 6) turn and shift of every frame from its logged pose."""
@@ -131,7 +135,7 @@ class Problem:
             at = [state.placed[frame] for frame in stars.frames]
             depth = inverse_depths(stars, at, state.depths[i], scale)
             state.depths[i] = depth
-            out.append(eliminated(stars, at, depth, scale, self.lenses.derivatives(stars, state.lens)))
+            out.append(eliminated(stars, at, depth, scale, state.by_lens[i]))
         return out
 
     def _graph(self, state: State, quadratics: Sequence[Quadratic], factor: float, scale: float) -> Graph:

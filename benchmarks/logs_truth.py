@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.engine.tables import read_table
-from pipeline.flight import camera_by_frame, cameras_of, columns, poses_of
+from pipeline.flight import camera_by_frame, cameras_of, columns, placements_of
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geometry.arrays import Floats
 from pipeline.simulation.bare import FORMS
@@ -69,7 +69,7 @@ def observed(run: Path) -> dict[tuple[str, float, float], Floats]:
     frames = read_table(run / "frames.parquet", "frames")
     record = json.loads((run / ".stages" / "ingest.json").read_text())
     origin = LocalFrame(**record["facts"]["origin"])
-    poses = poses_of(read_table(run / "poses.parquet", "poses"))
+    poses = placements_of(read_table(run / "poses.parquet", "poses"))
     cameras = camera_by_frame(frames, cameras_of(read_table(run / "cameras.parquet", "cameras")))
     depths = read_table(run / "depths", "depths")
     kept = np.array(depths.column("kept").to_pylist()) & (np.array(depths.column("method").to_pylist()) == METHOD)

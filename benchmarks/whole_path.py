@@ -145,7 +145,9 @@ def main(example: Path) -> None:
         run, peer = work / "run", work / "colmap"
         peer.mkdir()
         command = Path(sys.executable).with_name("epitransfer")
-        arguments = ("--out", run, "--to", "fuse", "--jobs", str(THREADS), "--set", 'depth.methods=["epitransfer"]')
+        # COLMAP is given the poses as logged, so ours stay as logged, too; sfm.py has both sides find theirs.
+        logged = ("--set", 'depth.methods=["epitransfer"]', "--set", 'refine.mode="none"')
+        arguments = ("--out", run, "--to", "fuse", "--jobs", str(THREADS), *logged)
         ours = measured([command, "run", example / "workflow.toml", *arguments], work / "ours.log")
         script = Path(__file__).with_name("colmap_side.py")
         theirs = measured([sys.executable, script, run, photos, peer, str(THREADS)], work / "theirs.log")

@@ -120,7 +120,8 @@ def test_map_error_splits_along_the_ray() -> None:
 
 def depth_rows(rows: list[tuple[str, float, str, float | None, bool]]) -> pa.Table:
     return DEPTHS.from_rows(
-        {"pair_id": pair, "frame_id": pair.split("~")[0], "u": u, "v": 2 * u, "method": method, "depth_m": depth,
+        {"pair_id": pair, "frame_id": pair.split("~")[0], "u": u, "v": 2 * u, "src_u": u, "src_v": u, "method": method,
+         "depth_m": depth,
          "sigma_depth_m": None if depth is None else 0.1 * depth, "parallax_deg": 1.0, "kept": kept, "reason": ""}
         for pair, u, method, depth, kept in rows
     )  # fmt: skip

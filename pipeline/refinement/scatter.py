@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.geometry.arrays import Floats, Ints
 
-SHARED_PX = 0.02
+SHARED_PX = 0.008
 """What all matches of an image have in common and their scatter does not show; found on rendered photos, whose lenses
 are exact."""
 _CELLS = (8, 6)

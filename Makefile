@@ -6,11 +6,12 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= runs/$(notdir $(basename $(WORKFLOW)))
 
-.PHONY: help example run test fuzz lint bench bench-logs pictures clean
+.PHONY: help example run test fuzz lint bench bench-poses bench-logs pictures clean
 help:
 	@echo "make example                 the built-in flight, from photos to scored points, in runs/example"
 	@echo "make run WORKFLOW=file.toml  a flight of yours, in runs/NAME (OUT=folder to choose)"
 	@echo "make test | lint | bench     the tests, the checks of the code, the timings as ratios"
+	@echo "make bench-poses             refinement on planted errors, redraws, real photo sets, thousands of frames"
 	@echo "make bench-logs              every kind of log against the stills, and big logs' speed and memory"
 	@echo "make fuzz                    10,000 damaged copies of a real file for every reader"
 	@echo "make pictures                the pictures of the README, from runs/example"
@@ -52,13 +53,24 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 # The networks' rows need weights: $EPITRANSFER_WEIGHTS, or `epitransfer models fetch`; real photo sets are looked for in
-# $EPITRANSFER_SHARED or ../shared. Some ten minutes on two cores; without either, two.
+# $EPITRANSFER_SHARED or ../shared. Some fifteen minutes on two cores; without either, six.
 bench: $(READY) example/workflow.toml
 	$(BIN)/python benchmarks/kernels.py
 	$(BIN)/python benchmarks/whole_path.py example
+	$(BIN)/python benchmarks/sfm.py example
 	$(BIN)/python benchmarks/matchers.py example
 	$(BIN)/python benchmarks/vga_path.py example
 	$(BIN)/python benchmarks/raft_depth.py example
+
+# What refinement does where the truth is known, and to real sets; an hour on two cores.
+bench-poses: $(READY) example
+	rm -rf runs/planted runs/real
+	$(BIN)/python benchmarks/refined.py example runs/planted
+	$(BIN)/python benchmarks/shared_errors.py example runs/example
+	$(BIN)/python benchmarks/calibration.py example runs/example
+	$(BIN)/python benchmarks/calibration_points.py example runs/example
+	$(BIN)/python benchmarks/real_refined.py runs/real
+	$(BIN)/python benchmarks/big_flight.py
 
 # The flight from logs against the flight from stills, and logs of 1 and 5 GB; some ten minutes and 6 GB of disk.
 bench-logs: $(READY) example

@@ -13,6 +13,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -22,8 +23,8 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement, Pose, PoseSigmas
 from pipeline.geometry.rotations import enu_from_cam
-from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
-from pipeline.refinement.flight.stars import Stars, stars_by_ref
+from pipeline.refinement.flight.flight import RefinedFlight, refine_flight, trusted_stars
+from pipeline.refinement.flight.stars import Stars
 from pipeline.refinement.logged import Log
 from pipeline.refinement.matched import Matched, Rays
 from pipeline.refinement.near import together
@@ -118,22 +119,18 @@ def refined(frames: int) -> tuple[RefinedFlight, list[Placement], Log, dict[str,
     """Everything, with the seconds it took."""
     true, time_s, before = flown(frames)
     names = [f"{i:05d}" for i in range(frames)]
-    number = {name: i for i, name in enumerate(names)}
+    known = dict(zip(names, logged(true, before), strict=True))
+    log = Log(known, dict.fromkeys(names, CAMERA), {}, dict(zip(names, time_s.tolist(), strict=True)))
     stars: list[Stars] = []
     pairs = []
-    spent = time.perf_counter()
+    began = time.perf_counter()
     for of_ref in matched_pairs(true):
         pairs += [matched.pair for matched in of_ref]
-        stars += stars_by_ref(of_ref, number)
+        stars += trusted_stars(log, of_ref)
     made = time.perf_counter()
-    log = Log(
-        dict(zip(names, logged(true, before), strict=True)),
-        dict.fromkeys(names, CAMERA),
-        {pair.pair_id: pair for pair in pairs},
-        dict(zip(names, time_s.tolist(), strict=True)),
-    )
+    log = replace(log, pairs={pair.pair_id: pair for pair in pairs})
     flight = refine_flight(log, stars, together(names, pairs))
-    seconds = {"matches made": made - spent, "refined": time.perf_counter() - made}
+    seconds = {"pairs checked": made - began, "refined": time.perf_counter() - made}
     return flight, true, log, seconds
 
 

@@ -182,6 +182,11 @@ def matches_by_pair(
     return [matches_of(truth, pair, rng, points[pair.ref], noise) for pair in pairs]
 
 
+def robust_cost(found: Floats, scale: float) -> float:
+    """The flight's cost of whitened residuals (m, 2)."""
+    return float(0.5 * scale**2 * np.sum(np.log1p(np.sum(found**2, axis=1) / scale**2)))
+
+
 def refined_flight(log: Log, found: Sequence[Matched]) -> RefinedFlight:
     """As the stage refines it."""
     return refine_flight(log, trusted_stars(log, found), together(tuple(log.poses), list(log.pairs.values())))

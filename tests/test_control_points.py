@@ -27,6 +27,7 @@ from refinement_scenes import (
     matches_by_pair,
     nees,
     off,
+    robust_cost,
     seen_in,
     straight,
 )
@@ -38,7 +39,6 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement, PoseSigmas
 from pipeline.refinement.flight.control import SIGMA_PX, Control, eliminated, most_likely, offsets_px, sights
-from pipeline.refinement.flight.elimination import robust_cost
 from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
 from pipeline.refinement.flight.lens import Lenses
 from pipeline.refinement.flight.stars import stars_by_ref
@@ -336,7 +336,6 @@ def test_the_gradient_is_that_of_the_cost_without_the_point(seed: int, scale: fl
     control, at, lenses = one_point(seed)
     _, point = profile(control, at, lenses, np.zeros(24), scale)
     found = eliminated(control, sights(control, lenses, np.zeros(6)), at, point, scale)
-    assert found.cost == pytest.approx(profile(control, at, lenses, np.zeros(24), scale)[0], rel=1e-9)
     steps = np.tile([1e-6] * 3 + [1e-4] * 3, 3).tolist() + [1e-5] * 6
     for i, step in enumerate(steps):
         error = np.zeros(24)

@@ -48,6 +48,7 @@ def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict
         out["shared_errors"] = dict(_named(flight.found))
         out["lens_as_given"] = list(flight.lens_as_given)
         out["parts"] = flight.parts
+        out["settled"] = flight.settled
         out["frames_refined"] = sum(frame.refined for frame in flight.frames.values())
         out["frames_off_the_log"] = {name: frame.problem for name, frame in flight.frames.items() if frame.problem}
         out["information_divided_by"] = round(flight.scatter, 3)
@@ -89,6 +90,8 @@ def warnings_of(facts: Mapping[str, Any]) -> list[str]:
         facts: As `facts_of` has them.
     """
     told = []
+    if not facts.get("settled", True):
+        told.append("the flight's poses still moved when the steps were used up: see frames and pairs with a problem")
     if facts.get("parts", 0) > 1:
         told.append(
             f"the flight falls into {facts['parts']} parts that no pair ties together, so they may lie as far from one "

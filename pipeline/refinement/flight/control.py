@@ -16,7 +16,7 @@ from pipeline.geometry.arrays import Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement
 from pipeline.geometry.rotations import skew
-from pipeline.refinement.flight.elimination import Quadratic, robust_cost
+from pipeline.refinement.flight.elimination import Quadratic
 from pipeline.refinement.flight.lens import NAMES, Lenses
 
 # A mark is clicked, by hand or by a detector, to about a pixel of the photo.
@@ -138,9 +138,7 @@ def eliminated(control: Control, seen: Sights, at: Sequence[Placement], point_m:
     # What is told twice of the point, by survey and by pixels, is told of the frames.
     gain = np.linalg.solve(of_point, cross.T).T
     information = rows.T @ jacobian.reshape(2 * m, -1) - gain @ cross.T
-    off = (point_m - control.surveyed_m) / control.sigma_m
-    cost = 0.5 * float(off @ off) + robust_cost(found[weight > 0.0], scale)
-    return Quadratic(information, rows.T @ found.ravel() - gain @ gradient, cost, np.zeros((0, len(information))))
+    return Quadratic(information, rows.T @ found.ravel() - gain @ gradient, np.zeros((0, len(information))))
 
 
 def offsets_px(control: Control, at: Sequence[Placement], cameras: Sequence[Camera]) -> Floats:

@@ -33,13 +33,11 @@ class Quadratic:
     Args:
         information: (6 k, 6 k), or with three more unknowns of the lens behind them.
         gradient: (6 k,).
-        cost: Of the present poses.
         by_cell: (cells, 6 k) sums of the stars' gradients within cells of the image.
     """
 
     information: Floats
     gradient: Floats
-    cost: float
     by_cell: Floats
 
 
@@ -104,12 +102,7 @@ def eliminated(
     gradients = _summed(np.einsum("mi,mij->mj", found, jacobian), stars, n)
     gradients -= cross * (depth_gradient / depth_information)[:, None]
     by_cell = sums_by_cell(gradients, stars.ref_px)
-    return Quadratic(information, gradients.sum(axis=0), robust_cost(found / root, scale), by_cell)
-
-
-def robust_cost(found: Floats, scale: float) -> float:
-    """The cost of whitened residuals (m, 2)."""
-    return float(0.5 * scale**2 * np.sum(np.log1p(np.sum(found**2, axis=1) / scale**2)))
+    return Quadratic(information, gradients.sum(axis=0), by_cell)
 
 
 def _weights(found: Floats, scale: float) -> Floats:

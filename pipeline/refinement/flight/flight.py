@@ -58,6 +58,7 @@ class RefinedFlight:
         control: How the control points fit.
         lens_as_given: Parameters of lenses that were looked for and are not determined.
         parts: Sets of frames that no pair ties together, those without any match left out.
+        settled: Whether the poses had stopped moving when the steps were used up.
     """
 
     frames: dict[str, RefinedFrame]
@@ -68,6 +69,7 @@ class RefinedFlight:
     control: tuple[ControlFit, ...] = ()
     lens_as_given: tuple[str, ...] = ()
     parts: int = 0
+    settled: bool = True
 
     def pair(self, log: Log, matched: Matched) -> RefinedPair:
         """A pair as the flight places it.
@@ -152,7 +154,7 @@ def refine_flight(
     cameras = {name: now[lenses.of_frame[i]] for i, name in enumerate(names)}
     found = (*_found(problem, state, covariances), *_found_of_lenses(problem, state, covariances))
     fits = _fits(problem, state, [*cameras.values()])
-    return RefinedFlight(frames, errors, cameras, found, scatter, fits, left, _parts(stars, len(names)))
+    return RefinedFlight(frames, errors, cameras, found, scatter, fits, left, _parts(stars, len(names)), state.settled)
 
 
 def _solved(problem: Problem) -> tuple[State, Covariances, float]:

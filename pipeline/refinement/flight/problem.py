@@ -40,6 +40,7 @@ class State:
         depths: Inverse depths of each ref frame's stars.
         by_lens: How each ref frame's stars change with the lenses as given; that hardly depends on what is found.
         points: (3,) of each control point, ENU m.
+        settled: Whether the last step was a small one.
     """
 
     placed: list[Placement]
@@ -49,6 +50,7 @@ class State:
     depths: list[Floats | None]
     by_lens: list[LensChange | None]
     points: list[Floats]
+    settled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,7 @@ class Problem:
             found = graph.minimum()
             size = self._move(state, found)
             if scale <= STAR_SCALE and size < _DONE:
+                state.settled = True
                 break
             scale = max(STAR_SCALE, scale * _HALVING)
         return state, self._quadratics(state, STAR_SCALE)

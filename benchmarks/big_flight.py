@@ -126,7 +126,7 @@ def refined(frames: int) -> tuple[RefinedFlight, list[Placement], Log, dict[str,
     began = time.perf_counter()
     for of_ref in matched_pairs(true):
         pairs += [matched.pair for matched in of_ref]
-        stars += trusted_stars(log, of_ref)
+        stars += trusted_stars(log, of_ref)[0]
     made = time.perf_counter()
     log = replace(log, pairs={pair.pair_id: pair for pair in pairs})
     flight = refine_flight(log, stars, together(names, pairs))

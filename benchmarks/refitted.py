@@ -84,7 +84,7 @@ class Matches:
         rows = [pair_row(some, found) for some, found in zip(self.matched, refined, strict=True)]
         table = RELATIVE_POSES.from_rows(rows)
         names = [some.pair.pair_id for some in self.matched]
-        medians = {name: float(np.median(found.after_px)) for name, found in zip(names, refined, strict=True)}
+        medians = {name: found.after.median_px or 0.0 for name, found in zip(names, refined, strict=True)}
         return Refit(relative_poses_of(table), medians, flight.found if flight else ())
 
     @property

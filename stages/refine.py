@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -69,13 +69,7 @@ class Config(StageConfig):
 
 @dataclass(frozen=True, slots=True)
 class _Refiner:
-    """What pairs are refined with.
-
-    Args:
-        log: The flight as logged.
-        mode: The configured one.
-        flight: The flight refined as a whole, in that mode.
-    """
+    """What pairs are refined with; `flight` is there in that mode."""
 
     log: Log
     mode: str
@@ -142,8 +136,13 @@ def _log(context: Context) -> Log:
 def _flight(
     config: Config, context: Context, log: Log, parts: Sequence[Path], near: Sequence[tuple[str, str]]
 ) -> RefinedFlight:
-    stars = [one for some in context.map(partial(_stars, log), parts, shard=1, label="parts") for one in some]
-    return refine_flight(log, stars, near, calibrate=config.calibrate, control=_control(config, context, log))
+    stars: list[Stars] = []
+    set_aside: dict[str, str] = {}
+    for some, reasons in context.map(partial(_stars, log), parts, shard=1, label="parts"):
+        stars += some
+        set_aside |= reasons
+    control = _control(config, context, log)
+    return replace(refine_flight(log, stars, near, calibrate=config.calibrate, control=control), set_aside=set_aside)
 
 
 def _control(config: Config, context: Context, log: Log) -> list[Control]:
@@ -174,8 +173,8 @@ def sources(config: Config) -> tuple[Path | str, ...]:
     return () if (named := config.control_points) is None else (named if is_url(named) else Path(named),)
 
 
-def _stars(log: Log, files: Sequence[Path]) -> list[Stars]:
-    return [one for file in files for one in trusted_stars(log, _matched(log, file))]
+def _stars(log: Log, files: Sequence[Path]) -> tuple[list[Stars], dict[str, str]]:
+    return trusted_stars(log, (matched for file in files for matched in _matched(log, file)))
 
 
 def _matched(log: Log, file: Path) -> list[Matched]:

@@ -189,7 +189,7 @@ def robust_cost(found: Floats, scale: float) -> float:
 
 def refined_flight(log: Log, found: Sequence[Matched]) -> RefinedFlight:
     """As the stage refines it."""
-    return refine_flight(log, trusted_stars(log, found), together(tuple(log.poses), list(log.pairs.values())))
+    return refine_flight(log, trusted_stars(log, found)[0], together(tuple(log.poses), list(log.pairs.values())))
 
 
 def off(found: Placement | Pose, truth: Placement) -> Floats:

@@ -383,8 +383,8 @@ def test_depths_are_many_times_better(
 def test_residuals_fall_to_the_matches_noise() -> None:
     it = scene(0)
     found = refine_pair(it.log, it.matched)
-    assert np.median(found.before_px) > 1.0
-    assert 0.03 < np.median(found.after_px) < 0.12
+    assert (found.before.median_px or 0.0) > 1.0
+    assert 0.03 < (found.after.median_px or 0.0) < 0.12
     assert 1.0 < (found.moved_sigmas or 0.0) < 6.0
 
 
@@ -409,7 +409,7 @@ def assert_refused(it: Scene, text: str) -> None:
     np.testing.assert_array_equal(found.placed.gain, np.eye(12))
     np.testing.assert_array_equal(found.placed.noise, np.zeros((12, 12)))
     np.testing.assert_array_equal(found.covariance, joint_covariance(log[REF], log[SRC]))
-    np.testing.assert_array_equal(found.after_px, found.before_px)
+    assert found.after == found.before
 
 
 def assert_refined(it: Scene, problem: str = "") -> RefinedPair:

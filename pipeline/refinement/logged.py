@@ -17,7 +17,7 @@ from pipeline.geometry.poses import (
     relative_pose,
 )
 from pipeline.refinement.matched import Matched
-from pipeline.refinement.rows import NONE, RefinedFrame, RefinedPair
+from pipeline.refinement.rows import NONE, Misses, RefinedFrame, RefinedPair
 
 NO_INLIER = "no match agrees with the logged pose"
 
@@ -56,7 +56,7 @@ def as_logged(log: Log, matched: Matched, problem: str = "") -> RefinedPair:
         problem: Why it was not refined.
     """
     ref, src = log.poses[matched.pair.ref], log.poses[matched.pair.src]
-    residual = matched.residuals_px(relative_pose(ref, src))
+    residual = Misses.of(matched.residuals_px(relative_pose(ref, src)))
     placed = PlacedPair.plain(Placement(ref.rotation, ref.centre), Placement(src.rotation, src.centre))
     covariance = joint_covariance(ref, src)
     return RefinedPair(placed, covariance, NONE, residual, residual, None, problem if len(matched) else NO_INLIER)

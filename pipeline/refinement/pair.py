@@ -27,11 +27,11 @@ from pipeline.geometry.poses import (
     relative_placement,
     relative_pose,
 )
-from pipeline.refinement.logged import Log, as_logged
+from pipeline.refinement.logged import NO_INLIER, Log, as_logged
 from pipeline.refinement.matched import Matched, Rays, epipolar
 from pipeline.refinement.refusals import Refusal, agreeing, in_front, refusal_after, refusal_before
 from pipeline.refinement.relative import CAUCHY_SCALE, Prior, fit, follow, inverse, minimal_fits
-from pipeline.refinement.rows import PAIR, RefinedFrame, RefinedPair
+from pipeline.refinement.rows import PAIR, Misses, RefinedFrame, RefinedPair
 from pipeline.refinement.scatter import SHARED_PX, scatter_of
 from pipeline.refinement.starts import homography_errors
 
@@ -86,8 +86,8 @@ def refine_pair(log: Log, matched: Matched) -> RefinedPair:
     problem = ""
     if found.moved_sigmas > FAR_SIGMAS:
         problem = f"the matches put it {found.moved_sigmas:.0f} sigmas from the logged pose; sigmas widened"
-    before_px, after_px = matched.residuals_px(pose), matched.residuals_px(after)
-    return RefinedPair(placed, covariance, PAIR, before_px, after_px, found.moved_sigmas, problem)
+    before, now = (Misses.of(matched.residuals_px(one)) for one in (pose, after))
+    return RefinedPair(placed, covariance, PAIR, before, now, found.moved_sigmas, problem)
 
 
 def surest_frames(
@@ -149,35 +149,41 @@ def relative_fit(matched: Matched, pose: RelativePose) -> RelativeFit:
     return RelativeFit(error, information, scale, moved)
 
 
-def trusted(log: Log, matched: Matched) -> Matched | None:
-    """The matches of a pair that agree with one pose; None where too few do for any of them to be trusted.
+def trusted(log: Log, matched: Matched) -> tuple[Matched, str]:
+    """The matches of a pair that agree with one pose; none of them, and why, where too few do.
 
     Args:
         log: The flight as logged.
         matched: The pair's inliers.
     """
+    if not len(matched):
+        return matched, NO_INLIER
     pose = relative_pose(log.poses[matched.pair.ref], log.poses[matched.pair.src])
     try:
-        return _agreeing_with_any(matched, pose, relative_fit(matched, pose).error[None])
+        return _agreeing_with_any(matched, pose, relative_fit(matched, pose).error[None]), ""
     except Refusal as refusal:
         if not refusal.doubtful:
             # What two frames leave open the others may tell.
-            return matched if refusal.errors is None else _agreeing_with_any(matched, pose, refusal.errors)
+            some = matched if refusal.errors is None else _agreeing_with_any(matched, pose, refusal.errors)
+            return some, ""
+        reason = str(refusal)
     # Or the log is what is wrong: a receiver that jumped, a gimbal that lied. The matches then agree without it.
     length = float(np.linalg.norm(pose.centre))
     anywhere = replace(pose, covariance=np.diag([_ANY_TURN_RAD**2] * 3 + [length**2] * 3))
     try:
         found = relative_fit(matched, anywhere)
     except Refusal:
-        return None
+        return matched.without_matches(), reason
     some = _agreeing_with_any(matched, anywhere, found.error[None])
-    return some if len(some) > 0.5 * len(matched) else None
+    return (some, "") if len(some) > 0.5 * len(matched) else (matched.without_matches(), reason)
 
 
 def _agreeing_with_any(matched: Matched, pose: RelativePose, errors: Floats) -> Matched:
-    """The matches that agree with one of several errors (k, 6) of a pose."""
-    found = epipolar(matched.rays, *Prior.of(pose).moved(errors))
-    return matched.some(np.flatnonzero(np.any(agreeing(found), axis=0)))
+    """The matches that agree with one of several errors (k, 6) of a pose, in front of both cameras."""
+    prior = Prior.of(pose)
+    agree = agreeing(epipolar(matched.rays, *prior.moved(errors)))
+    ahead = np.stack([in_front(matched.rays, prior, error) > 0.0 for error in errors])
+    return matched.some(np.flatnonzero(np.any(agree & ahead, axis=0)))
 
 
 def _starts(rays: Rays, prior: Prior, rng: np.random.Generator) -> Floats:

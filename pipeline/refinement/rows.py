@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +23,29 @@ _GIMBAL_SIGMAS = ("sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg")
 
 
 @dataclass(frozen=True, slots=True)
+class Misses:
+    """How far the rays of a pair's inliers miss each other: absolute epipolar residuals, as pixels of src.
+
+    Args:
+        n: Inliers.
+        rms_px: Root mean square; None of none.
+        median_px: Median; None of none.
+    """
+
+    n: int
+    rms_px: float | None
+    median_px: float | None
+
+    @classmethod
+    def of(cls, residuals_px: Floats) -> Misses:
+        """Of residuals (n,)."""
+        if not residuals_px.size:
+            return cls(0, None, None)
+        rms, median = float(np.sqrt(np.mean(residuals_px**2))), float(np.median(residuals_px))
+        return cls(residuals_px.size, rms, median)
+
+
+@dataclass(frozen=True, slots=True)
 class RefinedPair:
     """A pair's poses after refinement.
 
@@ -30,8 +53,8 @@ class RefinedPair:
         placed: Both cameras, and what their errors are made of.
         covariance: (12, 12) of the errors of both.
         mode: NONE, PAIR or FLIGHT.
-        before_px: (n,) absolute epipolar residuals of the inliers under the logged pose.
-        after_px: (n,) the same under this one.
+        before: Under the logged pose.
+        after: Under this one.
         moved_sigmas: How far it is from the logged pose; None where it is the logged one.
         problem: Why the logged pose stands, or what to distrust.
     """
@@ -39,8 +62,8 @@ class RefinedPair:
     placed: PlacedPair
     covariance: Floats
     mode: str
-    before_px: Floats
-    after_px: Floats
+    before: Misses
+    after: Misses
     moved_sigmas: float | None = None
     problem: str = ""
 
@@ -63,23 +86,15 @@ def pair_row(matched: Matched, found: RefinedPair) -> dict[str, object]:
         "gain": placed.gain.ravel().tolist() if alone else None,
         "noise": placed.noise.ravel().tolist() if alone else None,
         "n_matches": matched.n_matches,
-        "n_inliers": len(found.before_px),
-        "rms_before_px": _rms(found.before_px),
-        "median_before_px": _median(found.before_px),
-        "rms_after_px": _rms(found.after_px),
-        "median_after_px": _median(found.after_px),
+        "n_inliers": found.before.n,
+        "rms_before_px": found.before.rms_px,
+        "median_before_px": found.before.median_px,
+        "rms_after_px": found.after.rms_px,
+        "median_after_px": found.after.median_px,
         "moved_sigmas": found.moved_sigmas,
         "mode": found.mode,
         "problem": found.problem,
     }
-
-
-def _rms(values: Floats) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if values.size else None
-
-
-def _median(values: Floats) -> float | None:
-    return float(np.median(values)) if values.size else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +110,8 @@ class RefinedFrame:
 
     placed: Placement
     covariance: Floats
-    refined: bool = field(default=False)
-    problem: str = field(default="")
+    refined: bool = False
+    problem: str = ""
 
 
 def poses_table(frames: Mapping[str, RefinedFrame]) -> pa.Table:

@@ -36,11 +36,11 @@ def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict
         pairs: Every pair.
         flight: The flight, where it was refined as a whole.
     """
-    seen = [pair for pair in pairs if len(pair.before_px)]
+    seen = [pair for pair in pairs if pair.before.n]
     reasons = Counter(pair.problem for pair in pairs if pair.mode == NONE and pair.problem)
     out: dict[str, Any] = {
-        "median_epipolar_residual_px": _median([float(np.median(pair.before_px)) for pair in seen]),
-        "median_epipolar_residual_after_px": _median([float(np.median(pair.after_px)) for pair in seen]),
+        "median_epipolar_residual_px": _median([pair.before.median_px for pair in seen]),
+        "median_epipolar_residual_after_px": _median([pair.after.median_px for pair in seen]),
         "share_of_pairs_refined": round(sum(pair.mode != NONE for pair in seen) / max(len(pairs), 1), 4),
         "pairs_not_refined": dict(sorted(reasons.items())),
     }
@@ -50,6 +50,8 @@ def facts_of(pairs: Sequence[RefinedPair], flight: RefinedFlight | None) -> dict
         out["parts"] = flight.parts
         out["settled"] = flight.settled
         out["frames_refined"] = sum(frame.refined for frame in flight.frames.values())
+        out["frames_as_logged"] = [name for name, frame in flight.frames.items() if not frame.refined]
+        out["pairs_set_aside"] = dict(sorted(Counter(flight.set_aside.values()).items()))
         out["frames_off_the_log"] = {name: frame.problem for name, frame in flight.frames.items() if frame.problem}
         out["information_divided_by"] = round(flight.scatter, 3)
         if flight.control:
@@ -97,11 +99,13 @@ def warnings_of(facts: Mapping[str, Any]) -> list[str]:
             f"the flight falls into {facts['parts']} parts that no pair ties together, so they may lie as far from one "
             "another as the log is off; a larger pair.baseline_m or a smaller pair.min_overlap lets more pairs in"
         )
+    if left := facts.get("frames_as_logged"):
+        told.append(f"{counted(len(left), 'frame')} held by no match, {left[0]} among them: as logged")
     if off := facts.get("frames_off_the_log"):
         name, why = next(iter(off.items()))
         told.append(f"{counted(len(off), 'frame')} off the log, {name} among them: {why}")
-    if left := facts.get("lens_as_given"):
-        told.append(f"of the lens {', '.join(left)} stay as given: the images do not determine them")
+    if lens := facts.get("lens_as_given"):
+        told.append(f"of the lens {', '.join(lens)} stay as given: the images do not determine them, or not credibly")
     return told
 
 
@@ -125,5 +129,6 @@ def _figures(found: Found) -> dict[str, Any]:
     return {"unit": unit, **{name: float(f"{value * scale:.6g}") for name, value in values.items()}}
 
 
-def _median(values: Sequence[float]) -> float | None:
-    return round(float(np.median(values)), 4) if values else None
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(float(np.median(known)), 4) if known else None

@@ -24,6 +24,7 @@ from pipeline.refinement.scatter import sums_by_cell
 _FIRST_STEPS, _STEPS = 6, 2
 # Inverse depths are kept between that of a thousand kilometres and of a decimetre.
 _FARTHEST, _NEAREST = 1e-6, 10.0
+_LEAST_AHEAD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Quadratic:
 
 
 def residuals(stars: Stars, at: list[Placement], inverse_depth: Floats) -> tuple[Floats, Floats, Floats]:
-    """(m, 2) whitened residuals, and the rays w (m, 3) and y (m, 3) they come from."""
+    """(m, 2) whitened residuals, and the rays w (m, 3) and y (m, 3) they come from; NaN for a point behind src."""
     w, y = _rays(stars, at, inverse_depth)
     found = np.einsum("mij,mj->mi", stars.root, y[:, :2] / y[:, 2:] - stars.xy)
     return found, w, y
@@ -63,6 +64,7 @@ def inverse_depths(stars: Stars, at: list[Placement], start: Floats | None, scal
         found, _, y = residuals(stars, at, rho)
         by_depth = _by_point(stars, y, turned)
         weight = _weights(found, scale)
+        by_depth, found = np.nan_to_num(by_depth), np.nan_to_num(found)
         top = np.bincount(stars.star, weight * np.sum(by_depth * found, axis=1), len(rho))
         bottom = np.bincount(stars.star, weight * np.sum(by_depth**2, axis=1), len(rho))
         step = -top / np.maximum(bottom, 1e-12)
@@ -91,7 +93,9 @@ def eliminated(
         jacobian = np.concatenate([jacobian, _by_lens(stars, at, y, lens)], axis=2)
     by_depth = _by_point(stars, y, _toward(stars, at)[1])
     root = np.sqrt(weight)[:, None]
-    jacobian, by_depth, found = jacobian * root[:, :, None], by_depth * root, found * root
+    jacobian, by_depth, found = (
+        np.nan_to_num(values) * one for values, one in ((jacobian, root[:, :, None]), (by_depth, root), (found, root))
+    )
     size = jacobian.shape[2]
     flat = jacobian.reshape(-1, size)
     information = flat.T @ flat
@@ -106,8 +110,9 @@ def eliminated(
 
 
 def _weights(found: Floats, scale: float) -> Floats:
+    """(m,) of whitened residuals; none for what is not seen, by src or through the lens."""
     out: Floats = 1.0 / (1.0 + np.sum(found**2, axis=1) / scale**2)
-    return out
+    return np.nan_to_num(out)
 
 
 def _rays(stars: Stars, at: list[Placement], inverse_depth: Floats) -> tuple[Floats, Floats]:
@@ -115,7 +120,7 @@ def _rays(stars: Stars, at: list[Placement], inverse_depth: Floats) -> tuple[Flo
     w = (stars.ray @ at[0].rotation.T)[stars.star] + inverse_depth[stars.star, None] * _toward(stars, at)[0]
     y = np.einsum("mji,mj->mi", rotations, w)
     # A point behind src would be mirrored to where it seems to fit.
-    y[:, 2] = np.where(np.abs(y[:, 2]) < 1e-3, 1e-3, y[:, 2])
+    y[:, 2] = np.where(y[:, 2] > _LEAST_AHEAD, y[:, 2], np.nan)
     return w, y
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -24,7 +24,7 @@ from pipeline.refinement.logged import NO_INLIER, Log, logged_frames
 from pipeline.refinement.matched import Matched
 from pipeline.refinement.pair import trusted
 from pipeline.refinement.relative import inverse
-from pipeline.refinement.rows import FLIGHT, RefinedFrame, RefinedPair
+from pipeline.refinement.rows import FLIGHT, NONE, Misses, RefinedFrame, RefinedPair
 from pipeline.refinement.scatter import SHARED_PX, scatter_between
 
 
@@ -58,6 +58,7 @@ class RefinedFlight:
         control: How the control points fit.
         lens_as_given: Parameters of lenses that were looked for and are not determined.
         parts: Sets of frames that no pair ties together, those without any match left out.
+        set_aside: By pair, why its matches had no part.
         settled: Whether the poses had stopped moving when the steps were used up.
     """
 
@@ -70,6 +71,7 @@ class RefinedFlight:
     lens_as_given: tuple[str, ...] = ()
     parts: int = 0
     settled: bool = True
+    set_aside: Mapping[str, str] = field(default_factory=dict)
 
     def pair(self, log: Log, matched: Matched) -> RefinedPair:
         """A pair as the flight places it.
@@ -84,14 +86,16 @@ class RefinedFlight:
         now = relative_placement(ref, src, logged.covariance)
         off = np.concatenate([vector_from_rotation(now.rotation.T @ logged.rotation), now.centre - logged.centre])
         moved = float(np.sqrt(off @ inverse(logged.covariance) @ off))
+        reason = self.set_aside.get(pair.pair_id, "" if len(matched) else NO_INLIER)
+        held = self.frames[pair.ref].refined and self.frames[pair.src].refined
         return RefinedPair(
             PlacedPair.plain(ref, src),
             self.errors.joint(pair.ref, pair.src),
-            FLIGHT,
-            matched.residuals_px(logged),
-            self._through(log, matched).residuals_px(now),
+            FLIGHT if held else NONE,
+            Misses.of(matched.residuals_px(logged)),
+            Misses.of(self._through(log, matched).residuals_px(now)),
             moved,
-            "" if len(matched) else NO_INLIER,
+            f"its matches had no part: {reason}" if reason and held else reason,
         )
 
     def _through(self, log: Log, matched: Matched) -> Matched:
@@ -100,15 +104,24 @@ class RefinedFlight:
         return matched if cameras == given else matched.through(*cameras)
 
 
-def trusted_stars(log: Log, matched: Iterable[Matched]) -> list[Stars]:
+def trusted_stars(log: Log, matched: Iterable[Matched]) -> tuple[list[Stars], dict[str, str]]:
     """The stars of several pairs, of those matches of each that agree with one another.
 
     Args:
         log: The flight as logged; its frames are numbered in the order of its poses.
         matched: The pairs' inliers, those of one ref frame among them all.
+
+    Returns:
+        The stars, and by pair why none of its matches is among them.
     """
     number = {name: i for i, name in enumerate(log.poses)}
-    return stars_by_ref([some for one in matched if (some := trusted(log, one))], number)
+    kept, reasons = [], {}
+    for one in matched:
+        some, reason = trusted(log, one)
+        kept.append(some)
+        if reason:
+            reasons[one.pair.pair_id] = reason
+    return stars_by_ref(kept, number), reasons
 
 
 def refine_flight(

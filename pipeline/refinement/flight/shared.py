@@ -29,7 +29,7 @@ _LEVER_SIGMA_M = 0.1
 _CLOCK_SHARE, _LEVER_SHARE, _BIAS_SHARE = 0.7, 0.3, 0.3
 # A receiver's error changes over an hour; within a minute it moves by a fifth of its sigma.
 _BIAS_HOLDS_S = 3600.0
-_KNOT_EVERY_S = 60.0
+_KNOT_EVERY_S, _BETWEEN_FLIGHTS_S = 60.0, 600.0
 # Speeds come from neighbouring positions; over a longer gap a drone may have done anything.
 _LONGEST_GAP_S = 15.0
 _NEIGHBOURS = 2
@@ -120,32 +120,38 @@ def velocities(centre_m: Floats, time_s: Floats) -> tuple[Floats, Floats]:
     Returns:
         (n, 3) m/s, zero where the neighbours are too far in time; (n, 3) m/s one sigma of what the lines leave.
     """
-    velocity, rest = np.zeros_like(centre_m), np.zeros_like(centre_m)
+    velocity, rest = np.zeros_like(centre_m), np.full_like(centre_m, np.nan)
     known = np.flatnonzero(np.isfinite(time_s))
     order = known[np.argsort(time_s[known], kind="stable")]
     t, x = time_s[order], centre_m[order]
-    step_s = np.diff(t)
-    near = (step_s > 0.0) & (step_s <= _LONGEST_GAP_S)
-    leg = np.concatenate([[0], np.cumsum(~near)]) if len(order) else np.empty(0)
+    # Cameras that keep whole seconds give several frames one time: no reason to think that a leg ends.
+    leg = np.concatenate([[0], np.cumsum(np.diff(t) > _LONGEST_GAP_S)]) if len(order) else np.empty(0)
     for i, row in enumerate(order):
         rows = np.arange(max(i - _NEIGHBOURS, 0), min(i + _NEIGHBOURS + 1, len(order)))
         rows = rows[leg[rows] == leg[i]]
-        if len(rows) < 2:
-            continue
         since = t[rows] - t[rows].mean()
+        if not since @ since > 0.0:
+            continue
         velocity[row] = since @ x[rows] / (since @ since)
-        steps = np.diff(x[rows], axis=0) / np.diff(t[rows])[:, None]
+        step_s = np.diff(t[rows])
+        steps = np.diff(x[rows], axis=0)[step_s > 0.0] / step_s[step_s > 0.0, None]
         rest[row] = np.sqrt(np.mean((steps - velocity[row]) ** 2, axis=0))
-    return velocity, rest
+    # Where nothing is known, a frame may have been as fast as the others.
+    usual = np.sqrt(np.mean(velocity[np.isfinite(rest[:, 0])] ** 2, axis=0)) if np.isfinite(rest).any() else 0.0
+    return velocity, np.where(np.isfinite(rest), rest, usual)
 
 
 def _knots(time_s: Floats) -> Floats:
-    known = time_s[np.isfinite(time_s)]
+    """Instants of the bias: about every minute of flight, none in between flights."""
+    known = np.unique(time_s[np.isfinite(time_s)])
     if not len(known):
         return np.array([0.0, _KNOT_EVERY_S])
-    first, last = float(known.min()), float(known.max())
-    count = max(2, int(np.ceil((last - first) / _KNOT_EVERY_S)) + 1)
-    return np.linspace(first, max(last, first + 1.0), count)
+    out = []
+    for flown in np.split(known, np.flatnonzero(np.diff(known) > _BETWEEN_FLIGHTS_S) + 1):
+        first, last = float(flown[0]), float(flown[-1])
+        count = max(2, int(np.ceil((last - first) / _KNOT_EVERY_S)) + 1)
+        out.append(np.linspace(first, max(last, first + 1.0), count))
+    return np.concatenate(out)
 
 
 def _between(time_s: Floats, knots: Floats) -> tuple[Ints, Floats]:

@@ -115,7 +115,8 @@ def depth_rows() -> list[dict[str, Any]]:
             for k, (u, v) in enumerate(pixels):
                 depth = scale * truth[k]
                 rows.append(
-                    {"pair_id": f"{frame}~x", "frame_id": frame, "u": u, "v": v, "src_u": u, "src_v": v, "method": method, "depth_m": depth,
+                    {"pair_id": f"{frame}~x", "frame_id": frame, "u": u, "v": v, "src_u": u, "src_v": v,
+                     "method": method, "depth_m": depth,
                      "sigma_depth_m": 0.08 * depth, "parallax_deg": 3.0, "kept": k % 4 < 4 * share, "reason": ""}
                 )  # fmt: skip
     return rows
@@ -176,6 +177,8 @@ def test_known_depths_get_known_scores(tmp_path: Path) -> None:
         "n": epi["all"]["n"],
         "within_1_sigma": 0.0,
         "within_2_sigma": 1.0,
+        # Here the poses have no error.
+        "without_pose": {"n": epi["all"]["n"], "within_1_sigma": 0.0, "within_2_sigma": 1.0},
     }
     assert metrics["map"]["rmse_z_m"] == pytest.approx(0.1 * HEIGHT_M, abs=0.01)
     assert 1.0 < metrics["map"]["rmse_h_m"] < 6.0

@@ -13,6 +13,8 @@ covariance intersection). For the same reason Cov(a - b) <= 2 (C_a + C_b).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
@@ -97,7 +99,7 @@ def sums(values: Floats, group: Ints) -> Floats:
     Returns:
         (m, ...).
     """
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
     columns = [np.bincount(group, flat[:, i]).astype(np.float64) for i in range(flat.shape[1])]
     return np.stack(columns, axis=1).reshape(-1, *values.shape[1:])
 

@@ -41,7 +41,7 @@ class Survey:
     height_note: str
 
     def controls(self, images: Mapping[str, str], log: Log, sigma_m: float) -> tuple[list[Control], dict[str, str]]:
-        """The points that the flight's frames see, and why the rows of some photos are left out.
+        """The points that the flight's frames see, and why some rows are left out, by photo and line.
 
         Args:
             images: Path of every image by frame_id.
@@ -136,9 +136,11 @@ def doubts(flight: RefinedFlight | None, log: Log, sigma_m: float, where: str) -
         worst = max(flight.control, key=lambda fit: float(np.median(fit.after_px)))
         off = float(np.median(worst.after_px))
         said = f"{off:.0f} px" if np.isfinite(off) else "out of sight"
+        usual = float(np.median(after))
+        half = f"more than {usual:.0f} px off" if np.isfinite(usual) else "out of sight of their photos"
         raise InputError(
             "E-CONTROL-14", "the control points do not fit the photos", where=where,
-            found=f"half of them are more than {np.median(after):.0f} px off, {worst.name} most ({said})",
+            found=f"half of them are {half}, {worst.name} most ({said})",
             expected=f"less than {_WRONG_PX:g} px once the flight is fitted to them",
             hint="see that images, column and row, CRS and height datum are right; for points of a map, whose "
             "coordinates are not good to centimetres, state --set refine.control_sigma_m=1",

@@ -93,7 +93,10 @@ def warnings_of(facts: Mapping[str, Any]) -> list[str]:
     """
     told = []
     if not facts.get("settled", True):
-        told.append("the flight's poses still moved when the steps were used up: see frames and pairs with a problem")
+        told.append(
+            "the flight's poses still moved by more than a hundredth of a sigma when the steps were used up: hold them "
+            "against --set refine.mode=pair before you rely on them"
+        )
     if facts.get("parts", 0) > 1:
         told.append(
             f"the flight falls into {facts['parts']} parts that no pair ties together, so they may lie as far from one "

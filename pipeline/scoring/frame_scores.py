@@ -66,7 +66,8 @@ class FrameScore:
         n_matches: Matches, with a reference or not.
         n_visible: Returns the frame sees.
         methods: One entry per method of the job.
-        calibration: Of the published method.
+        calibration: Of the published method, against its sigma, the reference's spread and what the pose does to it.
+        calibration_alone: The same without what the frame's pose does to the reference.
         map: Of the published method.
     """
 
@@ -75,6 +76,7 @@ class FrameScore:
     n_visible: int
     methods: tuple[MethodSums, ...]
     calibration: CalibrationSums
+    calibration_alone: CalibrationSums
     map: MapSums
 
 
@@ -124,7 +126,7 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
         scored = mine.where(has)
         found = reference.where(has)
         by_pose = reference_sigma(item.view, scored.pixels, found, item.covariance)
-        sums = _sums(item.view, scored, found.depth_m, np.hypot(found.spread_m, by_pose))
+        sums = _sums(item.view, scored, found, by_pose)
         scores.append(FrameScore(item.frame_id, len(mine.pixels), seen, *sums))
         tables.append(_table(scored, found, by_pose))
     return pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores
@@ -191,8 +193,9 @@ def reference_sigma(view: View, pixels: Floats, reference: Reference, covariance
 
 
 def _sums(
-    view: View, scored: AlignedDepths, reference: Floats, reference_sigma_m: Floats
-) -> tuple[tuple[MethodSums, ...], CalibrationSums, MapSums]:
+    view: View, scored: AlignedDepths, found: Reference, by_pose: Floats
+) -> tuple[tuple[MethodSums, ...], CalibrationSums, CalibrationSums, MapSums]:
+    reference = found.depth_m
     common = np.asarray(scored.kept.all(axis=1))
     methods = tuple(
         MethodSums.of(scored.depth_m[:, m], reference, scored.kept[:, m], common) for m in range(len(scored.methods))
@@ -202,7 +205,8 @@ def _sums(
     depth, reference = scored.depth_m[kept, 0], reference[kept]
     return (
         methods,
-        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, reference_sigma_m[kept]),
+        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, np.hypot(found.spread_m, by_pose)[kept]),
+        CalibrationSums.of(depth, scored.sigma_m[kept, 0], reference, found.spread_m[kept]),
         MapSums.of(depth, reference, rays),
     )
 

@@ -23,6 +23,7 @@ def metrics_object(methods: Sequence[str], scores: Sequence[FrameScore]) -> dict
 
     Returns:
         `methods` (per method: all, common, kept_share, per_frame), `calibration` and `map`, both of the published one.
+        In `calibration` the same once more `without_pose`: without what the frames' absolute poses do to the reference.
         Where there is no pixel, null.
     """
     return {
@@ -39,6 +40,7 @@ def metrics_object(methods: Sequence[str], scores: Sequence[FrameScore]) -> dict
         "calibration": {
             "method": methods[0],
             **CalibrationSums.total(score.calibration for score in scores).metrics(),
+            "without_pose": CalibrationSums.total(score.calibration_alone for score in scores).metrics(),
         },
         "map": {"method": methods[0], **MapSums.total(score.map for score in scores).metrics()},
     }

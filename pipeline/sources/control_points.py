@@ -20,7 +20,7 @@ from pipeline.sources.files import opened
 _MAX_BYTES = 64 << 20
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 # The short form of OpenDroneMap, which PROJ does not read.
-_UTM = re.compile(r"WGS\s*84[\s/]+UTM(?:\s+zone)?\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_UTM = re.compile(r"WGS\s*84[\s/]+UTM(?:\s+zone)?\s+(0?[1-9]|[1-5]\d|60)\s*([NS])", re.IGNORECASE)
 _COLUMNS = ("x", "y", "z", "column", "row")
 _ROW = "x y z column row image [name], separated by blanks or tabs"
 

@@ -91,6 +91,9 @@ def sights(control: Control, lenses: Lenses, change: Floats) -> Sights:
         step = np.zeros_like(change)
         step[parameter] = _LENS_STEP
         rows = np.flatnonzero(which == parameter // len(NAMES))
+        if not len(rows):
+            # Another camera's, which does not see the point.
+            continue
         up, down = (
             _rays(lenses.changed(change + sign * step), which[rows], control.pixels[rows]) for sign in (1.0, -1.0)
         )

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
-from pipeline.geometry.poses import PlacedPair, relative_placement, relative_pose
+from pipeline.geometry.poses import PlacedPair, Placement, relative_placement, relative_pose
 from pipeline.geometry.rotations import vector_from_rotation
 from pipeline.refinement.flight.control import Control, ControlFit, offsets_px
 from pipeline.refinement.flight.graph import Covariances
@@ -212,7 +212,7 @@ def _errors(
 
 def _fits(problem: Problem, state: State, cameras: Sequence[Camera]) -> tuple[ControlFit, ...]:
     lenses, out = problem.lenses, []
-    logged = problem.start().placed
+    logged = [Placement(pose.rotation, pose.centre) for pose in problem.logged]
     for one in problem.control:
         given = [lenses.cameras[lenses.of_frame[frame]] for frame in one.frames]
         now = [cameras[frame] for frame in one.frames]

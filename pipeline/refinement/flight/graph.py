@@ -104,7 +104,7 @@ class Covariances:
         """The covariances between two unknowns each, couples (m, 2)."""
         out: list[Floats] = [np.empty(0)] * len(couples)
         order = np.argsort(couples[:, 0], kind="stable")
-        firsts = np.unique(couples[:, 0])
+        firsts, ordered = np.unique(couples[:, 0]), couples[order, 0]
         for some in np.array_split(firsts, max(1, len(firsts) // _AT_A_TIME)):
             places = np.cumsum([0, *(len(self.units[int(key)]) for key in some)])
             wanted = np.zeros((self.factors.shape[0], int(places[-1])))
@@ -112,7 +112,7 @@ class Covariances:
                 wanted[self.part[int(key)], start:end] = np.eye(end - start)
             found = self.factors.solve(wanted)
             for key, start, end in zip(some, places[:-1], places[1:], strict=True):
-                low, high = np.searchsorted(couples[order, 0], (key, key + 1))
+                low, high = np.searchsorted(ordered, (key, key + 1))
                 for row in order[low:high]:
                     other = int(couples[row, 1])
                     block = found[self.part[other], start:end].T

@@ -15,7 +15,7 @@ NAMES = ("focal", "k1", "k2")
 # What a lens from EXIF or an old calibration may be off by: two percent of focal length, some pixels at the corners.
 PRIOR_SIGMA: Floats = np.array([0.02, 0.05, 0.05])
 _STEP = 1e-5
-# With less than this taken off the prior's sigma, what was found is mostly the prior.
+# Where more than this is left of the prior's sigma, what was found is too much the prior's.
 _OBSERVED = 0.3
 _FAR = 3.0
 

@@ -154,7 +154,7 @@ def _control(config: Config, context: Context, log: Log) -> list[Control]:
     context.record("control_heights", found.height_note)
     context.record("control_left_out", left_out)
     for named, why in list(left_out.items())[:1]:
-        context.warn(f"control points in {counted(len(left_out), 'photo')} are not used: {named} among them, {why}")
+        context.warn(f"control points: {counted(len(left_out), 'row')} left out, {named} among them: {why}")
     return control
 
 

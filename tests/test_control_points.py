@@ -38,7 +38,15 @@ from pipeline.geodesy.heights import ELLIPSOIDAL
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement, PoseSigmas
-from pipeline.refinement.flight.control import SIGMA_PX, Control, eliminated, most_likely, offsets_px, sights
+from pipeline.refinement.flight.control import (
+    SIGMA_PX,
+    Control,
+    ControlFit,
+    eliminated,
+    most_likely,
+    offsets_px,
+    sights,
+)
 from pipeline.refinement.flight.flight import RefinedFlight, refine_flight
 from pipeline.refinement.flight.lens import Lenses
 from pipeline.refinement.flight.stars import stars_by_ref
@@ -97,6 +105,8 @@ def test_a_list() -> None:
         ("+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", 32617),
         ("WGS84 UTM 17N", 32617),
         ("wgs84 utm 56s", 32756),
+        ("WGS84 UTM 60N", 32660),
+        ("WGS84 UTM 01S", 32701),
         ("WGS 84 / UTM zone 5N", 32605),
         ("epsg:4326", 4326),
     ],
@@ -117,6 +127,8 @@ def test_the_first_line_is_a_crs_in_any_of_three_forms(line: str, epsg: int) -> 
         (f"Musterstadt 2024\n{ROW}\n", "E-CONTROL-05", ":1"),
         (f"EPSG:5703\n{ROW}\n", "E-CONTROL-05", ":1"),
         (f"EPSG:99999\n{ROW}\n", "E-CONTROL-05", ":1"),
+        (f"WGS84 UTM 61N\n{ROW}\n", "E-CONTROL-05", ":1"),
+        (f"WGS 84 / UTM zone 0S\n{ROW}\n", "E-CONTROL-05", ":1"),
         (f"{HEAD}{ROW}\n738668 4153830 154 91 793\n", "E-CONTROL-01", ":3"),
         (f"{HEAD}{ROW.replace('154.9032', '154,9032')}\n", "E-CONTROL-01", ":2"),
         (f"{HEAD}{ROW.replace('154.9032', 'nan')}\n", "E-CONTROL-01", ":2"),
@@ -253,8 +265,12 @@ PHOTOS = {"DJI_0001": "a/DJI_0001.JPG", "dji_0002": "b/dji_0002.jpg", "DJI_0003"
 SMALL = Camera("pinhole", 800, 600, 700.0, 700.0, 399.5, 299.5)
 
 
+def seen_rows(*images: str, u: float = 10.0, v: float = 20.0) -> str:
+    return HEAD + "".join(f"738668 4153830 154 {u} {v} {image}\n" for image in images)
+
+
 def seen_by(*images: str, u: float = 10.0, v: float = 20.0) -> ControlList:
-    return listed(HEAD + "".join(f"738668 4153830 154 {u} {v} {image}\n" for image in images))
+    return listed(seen_rows(*images, u=u, v=v))
 
 
 @pytest.mark.parametrize(
@@ -273,12 +289,17 @@ def test_photos_are_known_by_name(image: str, frame: str) -> None:
 
 
 def test_rows_of_no_photo_are_told_and_left_out() -> None:
-    found = seen_by("DJI_0001.JPG", "DJI_0003.JPG", "DJI_0099.JPG", "a/dji_0001.jpg")
-    marks, left_out = marks_of(found, np.zeros((1, 3)), PHOTOS, {"DJI_0001": SMALL})
+    found = listed(
+        seen_rows("DJI_0001.JPG", "DJI_0003.JPG", "DJI_0099.JPG", "a/dji_0001.jpg")
+        + "738669 4153830 154 10 20 DJI_0099.JPG\n"
+    )
+    marks, left_out = marks_of(found, np.zeros((2, 3)), PHOTOS, {"DJI_0001": SMALL})
     assert [mark.frames for mark in marks] == [("DJI_0001",)]
+    # One entry per row, however many of them are of one photo.
     assert left_out == {
-        "DJI_0003.JPG": "the frame is not usable",
-        "DJI_0099.JPG": "no such photo in the flight",
+        "DJI_0003.JPG, line 3": "the frame is not usable",
+        "DJI_0099.JPG, line 4": "no such photo in the flight",
+        "DJI_0099.JPG, line 6": "no such photo in the flight",
         "a/dji_0001.jpg, line 5": "an earlier row is of the same point and photo",
     }
     with pytest.raises(NothingLeftError, match="E-CONTROL-10"):
@@ -376,6 +397,19 @@ def test_a_point_behind_the_camera_says_nothing() -> None:
     assert not found.information.any()
     assert not found.gradient.any()
     assert np.all(np.isinf(offsets_px(behind, at, [CAMERA] * 3)))
+
+
+def test_a_point_that_one_of_two_cameras_does_not_see_leaves_that_lens_alone() -> None:
+    control, at, lenses = one_point(4)
+    seen_by_one = replace(control, frames=control.frames[[0, 2]], pixels=control.pixels[[0, 2]])
+    change = np.zeros(6)
+    whole, part = sights(control, lenses, change), sights(seen_by_one, lenses, change)
+    np.testing.assert_array_equal(part.by_lens, whole.by_lens[[0, 2]])
+    assert np.all(np.any(part.by_lens[:, :, :3] != 0.0, axis=1))
+    assert not part.by_lens[:, :, 3:].any()
+    found = eliminated(seen_by_one, part, [at[0], at[2]], control.surveyed_m, 3.0)
+    assert found.information.shape == (18, 18)
+    assert not found.information[15:].any()
 
 
 # --- a flight ---
@@ -512,6 +546,16 @@ def test_points_that_do_not_fit_are_refused(how: str) -> None:
         doubts(flight.found, flight.log, 0.05, "gcp_list.txt")
     # Points of a map may be off by so much.
     assert all("do not fit" not in said for said in doubts(flight.found, flight.log, 20.0, "gcp_list.txt"))
+
+
+def test_points_out_of_sight_are_said_to_be() -> None:
+    flight = held(0, 1)
+    fits = tuple(
+        ControlFit(fit.name, fit.before_px, np.full(len(fit.after_px), np.inf)) for fit in flight.found.control
+    )
+    with pytest.raises(InputError) as told:
+        doubts(replace(flight.found, control=fits), flight.log, 0.05, "gcp_list.txt")
+    assert told.value.found == "half of them are out of sight of their photos, gcp0 most (out of sight)"
 
 
 def test_a_flight_that_control_moves_by_more_than_its_log_allows_is_doubted() -> None:

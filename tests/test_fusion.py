@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyarrow import feather
 
 from pipeline.depthing import Limits, MatchedRays, depths_by
+from pipeline.geodesy.local_world import LocalTransform
 from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
@@ -19,9 +22,12 @@ from pipeline.geometry.poses import PlacedPair, Placement, relative_jacobian, re
 from pipeline.geometry.rotations import enu_from_cam
 from pipeline.geometry.transfer import VirtualView
 from pipeline.points.covariances import of_differences, of_means, squares, sums, whole
-from pipeline.points.fusion import surest_of_cubes
+from pipeline.points.fusion import Counts, fused_tile, surest_of_cubes
+from pipeline.points.fusion import Limits as Asked
 from pipeline.points.merge import Merged, agreed, merge, surest_of_pairs
+from pipeline.points.observations import Scene
 from pipeline.points.observed import Observed
+from pipeline.points.tiles import tile_corners, tile_name
 from pipeline.points.tracks import stars, tracks
 from pipeline.points.world import world_points
 
@@ -477,6 +483,28 @@ def test_thinning_keeps_the_surest_of_each_cube(seed: int, n: int, voxel: float)
     assert sorted(cubes[i] for i in kept) == sorted(set(cubes))
     for i in kept:
         assert covariance[i, 0, 0] == min(covariance[j, 0, 0] for j in range(n) if cubes[j] == cubes[i])
+
+
+# --- a tile ---
+
+
+@pytest.mark.parametrize("lies_here", [True, False])
+def test_a_tile_of_which_nothing_survives_is_empty(tmp_path: Path, lies_here: bool) -> None:
+    """Two observations of one point that disagree, alone in their tile or in the margin of another."""
+    flight = Flight([(4, 0), (4, 1)], ground=GROUND[:1])
+    observed, _ = disturbed(flight, {0: [1]})
+    corner = tile_corners(observed.xyz, 1000)[0] + (0 if lies_here else 1000)
+    folder = tmp_path / tile_name(corner)
+    folder.mkdir()
+    feather.write_feather(observed.table(), folder / "a.arrow")
+    names = [str(i) for i in range(len(STATIONS))]
+    scene = Scene(
+        {}, dict.fromkeys(names), dict.fromkeys(names, CAMERA), dict(zip(names, flight.frames, strict=True)),
+        flight.errors(), {}, {}, LocalTransform(), "epitransfer",
+    )  # fmt: skip
+    table, counts = fused_tile(scene, folder, Asked(1, 0.1, 1000))
+    assert table.num_rows == 0
+    assert counts == (Counts(observations=2, contradictory=1) if lies_here else Counts())
 
 
 def test_spilled_rows_come_back() -> None:

@@ -86,7 +86,7 @@ def marks_of(
         cameras: By frame_id, of the frames that can be used.
 
     Returns:
-        Marks in the list's order, and why some photos' rows were left out, by the photo's name.
+        Marks in the list's order, and why some rows were left out, by the photo's name and the row's line.
 
     Raises:
         InputError: A pixel lies outside its photo.
@@ -97,14 +97,15 @@ def marks_of(
     seen: list[list[tuple[str, Sighting]]] = [[] for _ in listed.points]
     for sighting in listed.sightings:
         frame = frame_of(sighting.image)
+        row = f"{sighting.image}, line {sighting.line}"
         if frame is None or frame not in cameras:
-            left_out[sighting.image] = "no such photo in the flight" if frame is None else "the frame is not usable"
+            left_out[row] = "no such photo in the flight" if frame is None else "the frame is not usable"
         elif any(frame == other for other, _ in seen[sighting.point]):
-            left_out[f"{sighting.image}, line {sighting.line}"] = "an earlier row is of the same point and photo"
+            left_out[row] = "an earlier row is of the same point and photo"
         elif _checked(sighting, cameras[frame], listed.where):
             seen[sighting.point].append((frame, sighting))
         else:
-            left_out[f"{sighting.image}, line {sighting.line}"] = "the lens has no ray at this pixel"
+            left_out[row] = "the lens has no ray at this pixel"
     marks = [_mark(point.name, place, of) for point, place, of in zip(listed.points, places, seen, strict=True) if of]
     if not marks:
         raise NothingLeftError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 
 import numpy as np
@@ -40,6 +41,7 @@ from pipeline.refinement.matched import Matched
 from pipeline.refinement.rows import (
     FLIGHT,
     PAIR,
+    Misses,
     RefinedFrame,
     RefinedPair,
     covariances_table,
@@ -167,6 +169,32 @@ def test_a_covariance_that_is_not_kept_is_no_zero() -> None:
         nothing.between("a", "a")
 
 
+@given(st.integers(0, 10**6), st.integers(1, 7))
+def test_many_at_once_are_as_each_by_name(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    names = [f"f{i}" for i in range(n)]
+    known = {}
+    for i, j in rng.integers(0, n, (rng.integers(0, 2 * n), 2)):
+        known.pop((j, i), None)
+        known[i, j] = rng.normal(size=(6, 6))
+    errors = PoseErrors.of(names, ((names[i], names[j], one) for (i, j), one in known.items()))
+    one, other = rng.integers(0, n, (2, 5, 3))
+    blocks, kept = errors.of_numbers(one, other)
+    for i, j, found, is_kept in zip(one.flat, other.flat, blocks.reshape(-1, 6, 6), kept.flat, strict=True):
+        want = known[i, j] if (i, j) in known else known[j, i].T if (j, i) in known else None
+        assert is_kept == (want is not None)
+        if want is not None:
+            np.testing.assert_array_equal(found, want)
+            np.testing.assert_array_equal(errors.between(names[i], names[j]), want)
+
+
+def test_a_long_flight_s_covariances_are_as_small_as_what_is_kept() -> None:
+    names = [f"f{i}" for i in range(1000)]
+    known = [*zip(names, names, strict=True), *zip(names[1:], names[:-1], strict=True)]
+    errors = PoseErrors.of(names, ((*couple, block(0)) for couple in known))
+    assert len(known) * 6 * 6 * 8 < len(pickle.dumps(errors)) < 1.2 * len(known) * 6 * 6 * 8
+
+
 def test_the_log_s_covariances_are_those_of_its_pairs() -> None:
     poses = logged(straight(4), Errors.none(4))
     errors = PoseErrors.of_log(poses, [("f00", "f01"), ("f01", "f03")])
@@ -188,7 +216,8 @@ def a_refined(mode: str) -> RefinedPair:
     ref, src = straight(2, seed=4).values()
     root = rng.normal(size=(12, 12)) * np.tile([1e-3] * 3 + [0.1] * 3, 2)[:, None]
     placed = PlacedPair(ref, src, rng.normal(size=(12, 12)), root @ root.T)
-    return RefinedPair(placed, root @ root.T, mode, np.array([1.0, 2.0, 6.0]), np.array([0.1, 0.2, 0.2]), 1.5, "told")
+    before, after = (Misses.of(np.array(px)) for px in ([1.0, 2.0, 6.0], [0.1, 0.2, 0.2]))
+    return RefinedPair(placed, root @ root.T, mode, before, after, 1.5, "told")
 
 
 @given(angles, centres)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.arrays import Floats, Ints
+from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.geometry.poses import Pose, common_covariance, own_covariance
 
 UNKNOWN = -1
@@ -24,12 +24,13 @@ class PoseErrors:
 
     Args:
         index: Number of each frame by its name.
-        block_of: (f, f) row of `blocks` for two frames' numbers; UNKNOWN where the covariance is not kept.
-        blocks: (m, 6, 6): turn and shift of the first frame by those of the second.
+        couples: (m,) the couples whose covariances are kept, rising: the first frame's number times that of all frames,
+            plus the second's, which is not less.
+        blocks: (m, 6, 6): turn and shift of the first frame by those of the second; the transpose is not kept.
     """
 
     index: Mapping[str, int]
-    block_of: Ints
+    couples: Ints
     blocks: Floats
 
     @classmethod
@@ -41,16 +42,12 @@ class PoseErrors:
             known: First frame, second frame, (6, 6); a frame with itself among them.
         """
         index = {name: i for i, name in enumerate(frames)}
-        block_of = np.full((len(frames), len(frames)), UNKNOWN, np.int64)
-        blocks: list[Floats] = []
+        blocks: dict[int, Floats] = {}
         for one, other, block in known:
             i, j = index[one], index[other]
-            block_of[i, j] = len(blocks)
-            blocks.append(block)
-            if i != j:
-                block_of[j, i] = len(blocks)
-                blocks.append(block.T)
-        return cls(index, block_of, np.array(blocks).reshape(-1, 6, 6))
+            blocks[min(i, j) * len(index) + max(i, j)] = block if i <= j else block.T
+        couples = np.array(sorted(blocks), np.int64)
+        return cls(index, couples, np.array([blocks[couple] for couple in couples.tolist()]).reshape(-1, 6, 6))
 
     @classmethod
     def of_log(cls, poses: Mapping[str, Pose], together: Iterable[tuple[str, str]]) -> PoseErrors:
@@ -64,16 +61,53 @@ class PoseErrors:
         shared = [(one, other, common_covariance(poses[one], poses[other])) for one, other in together]
         return cls.of(tuple(poses), [*own, *shared])
 
+    def rows(self, one: Ints, other: Ints) -> Ints:
+        """Where the covariances of frames are kept, whichever of the two comes first.
+
+        Args:
+            one: (...) numbers of frames.
+            other: (...) numbers of frames.
+
+        Returns:
+            (...) rows of `blocks`; UNKNOWN where the covariance is not kept.
+        """
+        wanted = np.minimum(one, other) * len(self.index) + np.maximum(one, other)
+        if not len(self.couples):
+            return np.full_like(wanted, UNKNOWN)
+        found = np.minimum(np.searchsorted(self.couples, wanted), len(self.couples) - 1)
+        return np.where(self.couples[found] == wanted, found, UNKNOWN)
+
+    def of_numbers(self, one: Ints, other: Ints) -> tuple[Floats, Bools]:
+        """Covariances between many frames.
+
+        Args:
+            one: (...) numbers of frames.
+            other: (...) numbers of frames.
+
+        Returns:
+            (..., 6, 6) turn and shift of the one by those of the other, and (...) whether they are kept; where not, the
+            first is no number of use.
+        """
+        rows = self.rows(one, other)
+        known = rows != UNKNOWN
+        if not len(self.blocks):
+            return np.zeros((*rows.shape, 6, 6)), known
+        blocks = self.blocks[rows]
+        turned = one > other
+        blocks[turned] = blocks[turned].swapaxes(1, 2)
+        return blocks, known
+
     def between(self, one: str, other: str) -> Floats:
         """(6, 6) covariance between two frames.
 
         Raises:
             KeyError: A frame is unknown, or the covariance is not kept.
         """
-        row = int(self.block_of[self.index[one], self.index[other]])
+        i, j = self.index[one], self.index[other]
+        row = int(self.rows(np.array(i), np.array(j)))
         if row == UNKNOWN:
             raise KeyError(f"no covariance is kept between {one} and {other}")
-        block: Floats = self.blocks[row]
+        block: Floats = self.blocks[row] if i <= j else self.blocks[row].T
         return block
 
     def joint(self, ref: str, src: str) -> Floats:

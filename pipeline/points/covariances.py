@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
-from pipeline.geometry.pose_errors import UNKNOWN, PoseErrors
+from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.points.observed import Observed
 
 # Numbers of the gathered covariances of a block of groups: 32 MiB.
@@ -126,9 +126,19 @@ def of_groups(factors: Floats, frames: Ints, errors: PoseErrors) -> tuple[Floats
     step = max(_BLOCK // (36 * k * k), 1)
     for start in range(0, m, step):
         part = slice(start, start + step)
-        rows = errors.block_of[frames[part, :, None], frames[part, None, :]]
-        known[part] = (rows != UNKNOWN).all(axis=(1, 2))
-        between = errors.blocks[rows].transpose(0, 1, 3, 2, 4).reshape(-1, 6 * k, 6 * k)
+        first, alike = _alike(frames[part], len(errors.index))
+        of = frames[part][first]
+        blocks, kept = errors.of_numbers(*np.broadcast_arrays(of[:, :, None], of[:, None, :]))
+        known[part] = np.all(kept[alike], axis=(1, 2))
+        between = blocks.transpose(0, 1, 3, 2, 4).reshape(-1, 6 * k, 6 * k)[alike]
         flat = factors[part].transpose(0, 2, 1, 3).reshape(-1, 3, 6 * k)
         found[part] = flat @ between @ np.swapaxes(flat, 1, 2)
     return found, known
+
+
+def _alike(frames: Ints, n_frames: int) -> tuple[Ints, Ints]:
+    """Rows (u,) of the different groups of frames (m, k), and which of them each group is (m,): few among many."""
+    first = alike = np.zeros(len(frames), np.int64)
+    for column in frames.T:
+        first, alike = np.unique(alike * n_frames + column, return_index=True, return_inverse=True)[1:]
+    return first, alike.reshape(-1)

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from redraws import times_of
 
 from pipeline.engine.tables import parquet_files, read_table

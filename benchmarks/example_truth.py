@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-from flight_truth import LEGS, FlightTruth
+from flight_truth import LEGS, FlightTruth, configured
 
 from pipeline.engine.tables import read_table
 from pipeline.flight import PairRow, camera_by_frame, cameras_of, column, columns, selected_pairs
@@ -135,7 +135,8 @@ def main(example: Path, run: Path) -> None:
     found = scored(run, truth, pairs)
     of_leg = {leg: np.array([truth.leg(pair.ref, pair.src) == leg for pair in pairs]) for leg in LEGS}
     near = np.array([truth.neighbours(pair.ref, pair.src) for pair in pairs])
-    print(f"Depths against the ray-cast truth, poses as logged; truth within {MAX_RANGE_M:g} m, outlines left out")
+    mode = configured(run, "refine")["mode"]
+    print(f"Depths against the ray-cast truth, refine.mode = {mode}; truth within {MAX_RANGE_M:g} m, outlines left out")
     print(f"{'':24}{'on the same pixels':>17}  |{'on its own kept pixels':>24}  |{'all, unmasked':>17}")
     print(f"{'':24}{'AbsRel':>9}{'d1':>8}  |{'kept':>7}{'AbsRel':>9}{'d1':>8}  |{'AbsRel':>9}{'d1':>8}")
     groups = {

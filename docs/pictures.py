@@ -41,9 +41,10 @@ def _overlays(folder: RunFolder, depth_axes: Axes, sigma_axes: Axes) -> None:
     root = (folder.record("ingest") or {})["facts"]["photo_root"]
     picture = read_colour(f"{root}/{image}")
     u, v, depth, sigma = (column(depths, name) for name in ("u", "v", "depth_m", "sigma_depth_m"))
+    percent = 100.0 * sigma / depth
     for axes, values, label, limits in (
         (depth_axes, depth, "depth (m)", (20, 100)),
-        (sigma_axes, 100 * sigma / depth, "predicted sigma (% of depth)", (0, 20)),
+        (sigma_axes, percent, "predicted sigma (% of depth)", (0.0, float(np.quantile(percent, 0.98)))),
     ):
         axes.imshow(picture.mean(axis=2), cmap="gray", vmin=0, vmax=330)
         dots = axes.scatter(u, v, c=values, s=2.5, cmap="turbo", vmin=limits[0], vmax=limits[1], linewidths=0)
@@ -59,7 +60,7 @@ def _plan(folder: RunFolder, axes: Axes) -> None:
     order = np.argsort(z)
     low, high = np.percentile(z, [1, 99])
     dots = axes.scatter(
-        (x - corner[0])[order], (y - corner[1])[order], c=z[order], s=0.3, cmap="viridis", vmin=low, vmax=high
+        (x - corner[0])[order], (y - corner[1])[order], c=z[order], s=0.6, cmap="viridis", vmin=low, vmax=high
     )
     axes.set(
         aspect="equal",

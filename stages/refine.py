@@ -90,7 +90,8 @@ class _Refiner:
 
 def run(config: Config, context: Context) -> str:
     """Refines the logged poses on the matches; writes poses, their covariances, relative poses and cameras."""
-    log = _log(context)
+    given, cameras_given = context.read("frames"), context.read("cameras")
+    log = _log(context, given, cameras_given)
     near = together(tuple(log.poses), list(log.pairs.values()))
     parts = parquet_files(context.path("matches"))
     flight = _flight(config, context, log, parts, near) if config.mode == FLIGHT else None
@@ -114,7 +115,7 @@ def run(config: Config, context: Context) -> str:
     context.write("poses", poses_table(frames))
     context.write("pose_covariances", covariances_table(errors, near))
     cameras = log.cameras if flight is None else flight.cameras
-    context.write("refined_cameras", cameras_table(context.read("cameras"), context.read("frames"), cameras))
+    context.write("refined_cameras", cameras_table(cameras_given, given, cameras))
     facts = facts_of([refined for _, refined in pairs], flight)
     for doubt in (*doubts(flight, log, config.control_sigma_m, str(config.control_points)), *warnings_of(facts)):
         context.warn(doubt)
@@ -123,9 +124,8 @@ def run(config: Config, context: Context) -> str:
     return sentence(counted(len(pairs), "pair"), config.mode, facts)
 
 
-def _log(context: Context) -> Log:
-    frames = context.read("frames")
-    cameras = camera_by_frame(frames, cameras_of(context.read("cameras")))
+def _log(context: Context, frames: pa.Table, cameras_given: pa.Table) -> Log:
+    cameras = camera_by_frame(frames, cameras_of(cameras_given))
     pairs = {pair.pair_id: pair for pair in selected_pairs(context.read("pairs"))}
     usable = frames.filter(frames.column("usable"))
     times = usable.column("time").cast(pa.int64())

@@ -21,6 +21,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.poses import (
     PlacedPair,
     Placement,
+    Pose,
     RelativePose,
     joint_covariance,
     relative_jacobian,
@@ -74,14 +75,12 @@ def refine_pair(log: Log, matched: Matched) -> RefinedPair:
     if not len(matched):
         return as_logged(log, matched)
     ref, src = log.poses[matched.pair.ref], log.poses[matched.pair.src]
-    joint = joint_covariance(ref, src)
-    seen = relative_jacobian(ref, src)
-    pose = relative_placement(ref, src, seen @ joint @ seen.T)
+    pose = relative_pose(ref, src)
     try:
         found = relative_fit(matched, pose)
     except Refusal as refusal:
         return as_logged(log, matched, str(refusal))
-    placed, covariance = _placed(log, matched, joint, found, pose)
+    placed, covariance = _placed(ref, src, found, pose)
     after = relative_placement(placed.ref, placed.src, pose.covariance)
     problem = ""
     if found.moved_sigmas > FAR_SIGMAS:
@@ -182,7 +181,7 @@ def _agreeing_with_any(matched: Matched, pose: RelativePose, errors: Floats) -> 
     """The matches that agree with one of several errors (k, 6) of a pose, in front of both cameras."""
     prior = Prior.of(pose)
     agree = agreeing(epipolar(matched.rays, *prior.moved(errors)))
-    ahead = np.stack([in_front(matched.rays, prior, error) > 0.0 for error in errors])
+    ahead = np.stack([in_front(matched.rays, prior, error) for error in errors])
     return matched.some(np.flatnonzero(np.any(agree & ahead, axis=0)))
 
 
@@ -217,13 +216,10 @@ def _with_shared_turn(information: Floats, sigma_rad: float) -> Floats:
     return out
 
 
-def _placed(
-    log: Log, matched: Matched, joint: Floats, found: RelativeFit, pose: RelativePose
-) -> tuple[PlacedPair, Floats]:
+def _placed(ref: Pose, src: Pose, found: RelativeFit, pose: RelativePose) -> tuple[PlacedPair, Floats]:
     """Both cameras after the fit, and the covariance of their errors."""
-    ref, src = log.poses[matched.pair.ref], log.poses[matched.pair.src]
-    seen = relative_jacobian(ref, src)
-    both = joint @ seen.T @ inverse(pose.covariance) @ found.error
+    joint = joint_covariance(ref, src)
+    both = joint @ relative_jacobian(ref, src).T @ inverse(pose.covariance) @ found.error
     new_ref = Placement(ref.rotation, ref.centre).moved(both[:6])
     ref_from_src, centre = Prior.of(pose).moved(found.error)
     # The relative pose as found, not as the two first-order moves would leave it.

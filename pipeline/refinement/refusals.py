@@ -147,12 +147,12 @@ def _left_by_a_turn(rays: Rays) -> float:
     return float(np.median(left))
 
 
-def in_front(rays: Rays, prior: Prior, error: Floats) -> Floats:
-    """(n,) 1 where the point nearest to both rays is in front of both cameras."""
+def in_front(rays: Rays, prior: Prior, error: Floats) -> Bools:
+    """(n,) where the point nearest to both rays is in front of both cameras."""
     ref_from_src, centre = prior.moved(error)
     src = rays.src @ ref_from_src.T
     # s ref - t src = centre in least squares.
     aa, bb, ab = (np.sum(x * y, axis=1) for x, y in ((rays.ref, rays.ref), (src, src), (rays.ref, src)))
     ac, bc = rays.ref @ centre, src @ centre
-    out: Floats = ((bb * ac - ab * bc > 0.0) & (ab * ac - aa * bc > 0.0)).astype(np.float64)
+    out: Bools = (bb * ac - ab * bc > 0.0) & (ab * ac - aa * bc > 0.0)
     return out

@@ -17,13 +17,12 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement
 from pipeline.geometry.rotations import skew
 from pipeline.refinement.flight.elimination import Quadratic
-from pipeline.refinement.flight.lens import NAMES, Lenses
+from pipeline.refinement.flight.lens import Lenses
 
 # A mark is clicked, by hand or by a detector, to about a pixel of the photo.
 SIGMA_PX = 1.0
 _STEPS = 4
 _NEAREST_M = 0.1
-_LENS_STEP = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,22 +83,11 @@ def sights(control: Control, lenses: Lenses, change: Floats) -> Sights:
         change: (3 c,) of the lenses.
     """
     which = lenses.of_frame[control.frames]
-    given = _rays(lenses.cameras, which, control.pixels)
-    root = np.stack([lenses.cameras[k].pixel_jacobian(ray) for k, ray in zip(which, given, strict=True)]) / SIGMA_PX
-    by_lens = np.zeros((len(which), 2, len(lenses.unknown)))
-    for column, parameter in enumerate(lenses.unknown):
-        step = np.zeros_like(change)
-        step[parameter] = _LENS_STEP
-        rows = np.flatnonzero(which == parameter // len(NAMES))
-        if not len(rows):
-            # Another camera's, which does not see the point.
-            continue
-        up, down = (
-            _rays(lenses.changed(change + sign * step), which[rows], control.pixels[rows]) for sign in (1.0, -1.0)
-        )
-        by_lens[rows, :, column] = (up - down)[:, :2] / (2.0 * _LENS_STEP)
-    now = _rays(lenses.changed(change), which, control.pixels) if np.any(change) else given
-    return Sights(now[:, :2], root, by_lens)
+    given = lenses.through(which, control.pixels, np.zeros_like(change))
+    rays = np.column_stack([given, np.ones(len(given))])
+    root = np.stack([lenses.cameras[k].pixel_jacobian(ray) for k, ray in zip(which, rays, strict=True)]) / SIGMA_PX
+    now = lenses.through(which, control.pixels, change) if np.any(change) else given
+    return Sights(now, root, lenses.by_unknowns(which, control.pixels, change))
 
 
 def most_likely(control: Control, seen: Sights, at: Sequence[Placement], start_m: Floats, scale: float) -> Floats:
@@ -189,8 +177,3 @@ def _of_point(
     information = surveyed * np.eye(3) + np.einsum("m,mki,mkj->ij", weight, by_point, by_point)
     gradient = surveyed * (point - control.surveyed_m) + np.einsum("m,mki,mk->i", weight, by_point, found)
     return information, gradient
-
-
-def _rays(cameras: Sequence[Camera], which: Ints, pixels: Floats) -> Floats:
-    """(m, 3) rays of pixels through cameras by number."""
-    return np.stack([cameras[k].rays(pixel) for k, pixel in zip(which, pixels, strict=True)]).reshape(-1, 3)

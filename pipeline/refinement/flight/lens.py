@@ -82,32 +82,51 @@ class Lenses:
         odd = (np.abs(change) > _FAR * self.sigma).reshape(-1, len(NAMES)).any(axis=1)
         return replace(self, sigma=np.where(keep & ~np.repeat(odd, len(NAMES)), self.sigma, 0.0))
 
+    def through(self, which: Ints, pixels: Floats, change: Floats) -> Floats:
+        """Pixels on the image planes of changed lenses.
+
+        Args:
+            which: (m,) the camera of each pixel.
+            pixels: (m, 2) as given.
+            change: (3 c,) of the lenses.
+
+        Returns:
+            (m, 2).
+        """
+        now = self.changed(change)
+        out = np.empty((len(pixels), 2))
+        for k in np.unique(which):
+            rows = which == k
+            out[rows] = now[k].rays(pixels[rows])[:, :2]
+        return out
+
+    def by_unknowns(self, which: Ints, pixels: Floats, change: Floats) -> Floats:
+        """(m, 2, u) how pixels move on the image planes with the unknown parameters; arguments as in `through`."""
+        out = np.zeros((len(pixels), 2, len(self.unknown)))
+        for column, parameter in enumerate(self.unknown):
+            step = np.zeros_like(change)
+            step[parameter] = _STEP
+            # Another camera's parameter moves none of its pixels.
+            rows = which == parameter // len(NAMES)
+            up, down = (self.through(which[rows], pixels[rows], change + sign * step) for sign in (1.0, -1.0))
+            out[rows, :, column] = (up - down) / (2.0 * _STEP)
+        return out
+
     def rays(self, stars: Stars, change: Floats) -> Stars:
         """The stars as changed lenses see them."""
-        now = self.changed(change)
-        ref, src = self._rays(stars, now)
-        return replace(stars, ray=ref, xy=src)
+        ref, src = (self.through(*seen, change) for seen in self._seen(stars))
+        return replace(stars, ray=np.column_stack([ref, np.ones(len(ref))]), xy=src)
 
     def derivatives(self, stars: Stars, change: Floats) -> LensChange | None:
         """How the stars' rays move with the unknown parameters; None where there are none."""
-        columns = []
-        for k in self.unknown:
-            step = np.zeros_like(change)
-            step[k] = _STEP
-            up, down = (self._rays(stars, self.changed(change + sign * step)) for sign in (1.0, -1.0))
-            columns.append([(a - b) / (2.0 * _STEP) for a, b in zip(up, down, strict=True)])
-        if not columns:
+        if not len(self.unknown):
             return None
-        ref, src = (np.stack(of_role, axis=2) for of_role in zip(*columns, strict=True))
-        return LensChange(ref[:, :2], src)
+        return LensChange(*(self.by_unknowns(*seen, change) for seen in self._seen(stars)))
 
-    def _rays(self, stars: Stars, cameras: Sequence[Camera]) -> tuple[Floats, Floats]:
-        of_stars = self.of_frame[stars.frames]
-        src = np.empty_like(stars.src_px)
-        for place in np.unique(stars.of):
-            rows = stars.of == place
-            src[rows] = cameras[of_stars[place]].rays(stars.src_px[rows])[:, :2]
-        return cameras[of_stars[0]].rays(stars.ref_px), src
+    def _seen(self, stars: Stars) -> tuple[tuple[Ints, Floats], tuple[Ints, Floats]]:
+        """Cameras and pixels of the stars in ref, and of their observations."""
+        which = self.of_frame[stars.frames]
+        return (np.full(len(stars.ref_px), which[0]), stars.ref_px), (which[stars.of], stars.src_px)
 
 
 def changed(camera: Camera, change: Floats) -> Camera:

@@ -4,7 +4,7 @@ from schemas._columns import TableSchema, flag, number, single, text
 
 SCORES = TableSchema(
     "pixels",
-    2,
+    3,
     "Depths beside the reference depth at the same pixel.",
     (
         text("pair_id", "The pair in `pairs`."),
@@ -14,6 +14,7 @@ SCORES = TableSchema(
         text("method", "The method, as in `depths`."),
         number("depth_m", "m", "Estimated depth.", frame="ref RDF", nullable=True),
         number("sigma_depth_m", "m", "Its predicted sigma.", frame="ref RDF", nullable=True),
+        single("parallax_deg", "deg", "Angle between the rays of the match.", nullable=True),
         number("reference_m", "m", "Reference depth at the pixel.", frame="ref RDF"),
         single("reference_spread_m", "m", "Spread of the reference about its local surface."),
         single("reference_sigma_m", "m", "One sigma of the reference by the error of the frame's pose."),

@@ -21,9 +21,11 @@ from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
 from pipeline.lidar.nearby import LocalTiles
 from pipeline.lidar.tiles import expand, read_local_tile, read_tile
 from pipeline.lidar.visibility import View
-from pipeline.scoring.frame_scores import FrameScore, FrameView, ScoringJob, frames_in, methods_of, score_frames
+from pipeline.scoring.frame_scores import FrameScore, ScoringJob, score_frames
+from pipeline.scoring.lines import SparseLines, frames_in, methods_of
 from pipeline.scoring.refusals import apart, check_datums, no_reference, nothing_to_score_against
 from pipeline.scoring.summary import metrics_object, sentence, to_json
+from pipeline.scoring.truth import FrameView, Survey
 from schemas import SCORES
 
 _FRAMES_PER_SHARD = 8
@@ -59,21 +61,17 @@ def run(config: Config, context: Context) -> str:
     meeting = tiles.meeting(centres, config.max_range_m)
     if not meeting:
         raise apart(tiles, centres, config.max_range_m)
-    job = ScoringJob(
-        replace(tiles, tiles=meeting),
-        depths,
-        methods_of(depths, context.setting("depth.methods")[0]),
-        config.max_range_m,
-    )
+    lines = SparseLines(depths, methods_of(depths, context.setting("depth.methods")[0]))
+    job = ScoringJob(Survey(replace(tiles, tiles=meeting), config.max_range_m), lines)
     scores: list[FrameScore] = []
     with pq.ParquetWriter(folder / "pixels.parquet", SCORES.arrow(), compression="zstd") as writer:
         shards = context.map(partial(score_frames, job), views, shard=_FRAMES_PER_SHARD, label="frames")
         for table, part in shards:
             writer.write_table(_checked(table))
             scores += part
-    metrics = metrics_object(job.methods, scores)
+    metrics = metrics_object(lines.methods, scores)
     _tell(context, scores, tiles, meeting)
-    if not any(score.methods[0].n_scored for score in scores):
+    if not any(score.sums.methods[0].n_scored for score in scores):
         raise no_reference(
             sum(score.n_matches for score in scores),
             sum(score.n_visible for score in scores),
@@ -149,7 +147,7 @@ def _tell(context: Context, scores: Sequence[FrameScore], tiles: LocalTiles, mee
     context.record("lidar_tiles", {"given": len(tiles.tiles), "used": len(meeting)})
     context.record("lidar_heights", sorted({tiles.transform(tile).height_note for tile in tiles.tiles}))
     context.record("matches", sum(score.n_matches for score in scores))
-    context.record("matches_with_reference", sum(score.methods[0].n_scored for score in scores))
+    context.record("matches_with_reference", sum(score.sums.methods[0].n_scored for score in scores))
     context.record("frames_that_see_no_lidar", blind)
     context.record(
         "calibration_sigma",
@@ -166,7 +164,7 @@ def sources(config: Config) -> tuple[Path, ...]:
 
 STAGE = Stage(
     "score",
-    2,
+    3,
     Config,
     ("frames", "refined_cameras", "poses", "depths", "sweeps"),
     ("scores",),

@@ -62,6 +62,10 @@ class HeightField:
         np.maximum.at(top.reshape(-1), index[:, 0] * shape[1] + index[:, 1], points_in_enu_m[:, 2])
         return HeightField(origin, cell, _filled(top))
 
+    def moved(self, translation_m: Floats) -> HeightField:
+        """The same field shifted by (3,) ENU m."""
+        return HeightField(self.origin_m + translation_m[:2], self.cell_m, self.top_m + translation_m[2])
+
     def at(self, east_m: Floats, north_m: Floats) -> Floats:
         """The top of the cell under each position; -inf outside the grid.
 

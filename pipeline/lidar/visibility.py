@@ -14,6 +14,7 @@ Under a ceiling or a crown that was scanned from below nothing stands on columns
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy import ndimage
@@ -68,6 +69,11 @@ class VisibleReturns:
     pixels: Floats
     depth_m: Floats
     footprint_px: Floats
+
+    @classmethod
+    def none(cls) -> Self:
+        """Nothing in sight."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 def visible_returns(

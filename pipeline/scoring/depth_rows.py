@@ -22,6 +22,7 @@ class AlignedDepths:
         pair_id: (n,) the pair of each match.
         frame_id: (n,) its ref frame.
         pixels: (n, 2) u, v in the ref image as given.
+        parallax_deg: (n,) angle between the two rays of the match; the methods of a match have the same.
         depth_m: (n, m) depths, m; NaN where a method has none.
         sigma_m: (n, m) predicted sigmas, m; NaN where a method has none.
         kept: (n, m) which a method publishes.
@@ -31,6 +32,7 @@ class AlignedDepths:
     pair_id: AnyArray
     frame_id: AnyArray
     pixels: Floats
+    parallax_deg: Floats
     depth_m: Floats
     sigma_m: Floats
     kept: Bools
@@ -38,8 +40,8 @@ class AlignedDepths:
     def where(self, rows: AnyArray) -> AlignedDepths:
         """The lines of some rows."""
         return AlignedDepths(
-            self.methods, self.pair_id[rows], self.frame_id[rows], self.pixels[rows], self.depth_m[rows],
-            self.sigma_m[rows], self.kept[rows],
+            self.methods, self.pair_id[rows], self.frame_id[rows], self.pixels[rows], self.parallax_deg[rows],
+            self.depth_m[rows], self.sigma_m[rows], self.kept[rows],
         )  # fmt: skip
 
 
@@ -78,6 +80,8 @@ def align(depths: pa.Table, methods: tuple[str, ...]) -> AlignedDepths:
     pixels[line] = uv
     if np.any(differs := np.any(pixels[line] != uv, axis=1)):
         raise _misaligned(pair_names[int(pair[differs][0])])
+    parallax = np.full(count, np.nan)
+    parallax[line] = _floats(depths, "parallax_deg")[order]
     out_depth, out_sigma = (np.full((count, len(methods)), np.nan) for _ in range(2))
     out_kept = np.zeros((count, len(methods)), np.bool_)
     depth, sigma = _floats(depths, "depth_m")[order], _floats(depths, "sigma_depth_m")[order]
@@ -86,7 +90,7 @@ def align(depths: pa.Table, methods: tuple[str, ...]) -> AlignedDepths:
     names, frames = np.empty(count, object), np.empty(count, object)
     names[line] = np.asarray(pair_names, object)[pair]
     frames[line] = depths["frame_id"].to_numpy()[order]
-    return AlignedDepths(methods, names, frames, pixels, out_depth, out_sigma, out_kept)
+    return AlignedDepths(methods, names, frames, pixels, parallax, out_depth, out_sigma, out_kept)
 
 
 def _codes(column: pa.ChunkedArray) -> tuple[AnyArray, list[str]]:

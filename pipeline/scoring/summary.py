@@ -29,9 +29,13 @@ def metrics_object(methods: Sequence[str], scores: Sequence[FrameScore]) -> dict
     return {
         "methods": {
             name: {
-                **MethodSums.total(score.methods[m] for score in scores).metrics(),
+                **MethodSums.total(score.sums.methods[m] for score in scores).metrics(),
                 "per_frame": [
-                    {"frame_id": score.frame_id, "n_scored": score.methods[m].n_scored, **score.methods[m].metrics()}
+                    {
+                        "frame_id": score.frame_id,
+                        "n_scored": score.sums.methods[m].n_scored,
+                        **score.sums.methods[m].metrics(),
+                    }
                     for score in scores
                 ],
             }
@@ -39,10 +43,10 @@ def metrics_object(methods: Sequence[str], scores: Sequence[FrameScore]) -> dict
         },
         "calibration": {
             "method": methods[0],
-            **CalibrationSums.total(score.calibration for score in scores).metrics(),
-            "without_pose": CalibrationSums.total(score.calibration_alone for score in scores).metrics(),
+            **CalibrationSums.total(score.sums.calibration for score in scores).metrics(),
+            "without_pose": CalibrationSums.total(score.sums.calibration_alone for score in scores).metrics(),
         },
-        "map": {"method": methods[0], **MapSums.total(score.map for score in scores).metrics()},
+        "map": {"method": methods[0], **MapSums.total(score.sums.map for score in scores).metrics()},
     }
 
 

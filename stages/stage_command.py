@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,6 +18,7 @@ from stages.registry import MODELS, STAGES
 from stages.workflow import execute, kept_sections
 
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, with every number of the stage.")]
 
 
 def ingest(
@@ -30,6 +32,7 @@ def ingest(
     set_: Set = None,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
+    as_json: AsJson = False,
 ) -> None:
     """Reads the sources; takes them from a workflow file, the options, or the run folder."""
     folder = RunFolder(run)
@@ -51,13 +54,20 @@ def ingest(
     named = {"photos": photos, "logs": logs, "bags": bags, "videos": videos, "camera": camera}
     given = {key: value for key, value in named.items() if value}
     layers.append(("command line", absolute_paths({"ingest": given}, MODELS, Path.cwd())))
-    _run("ingest", folder, layers, set_, jobs, scheduler)
+    _run("ingest", folder, layers, set_, jobs, scheduler, as_json=as_json)
 
 
-def match(run: Run, set_: Set = None, jobs: Jobs = None, device: Device = None, scheduler: Scheduler = None) -> None:
+def match(
+    run: Run,
+    set_: Set = None,
+    jobs: Jobs = None,
+    device: Device = None,
+    scheduler: Scheduler = None,
+    as_json: AsJson = False,
+) -> None:
     """Runs match with the configuration kept in the run folder."""
     layers = [*_kept("match", run), ("command line", on_device(device))]
-    _run("match", RunFolder(run), layers, set_, jobs, scheduler)
+    _run("match", RunFolder(run), layers, set_, jobs, scheduler, as_json=as_json)
 
 
 def _kept(name: str, run: Path) -> list[tuple[str, Sections]]:
@@ -66,8 +76,10 @@ def _kept(name: str, run: Path) -> list[tuple[str, Sections]]:
 
 
 def _stage_command(name: str) -> Callable[..., None]:
-    def command(run: Run, set_: Set = None, jobs: Jobs = None, scheduler: Scheduler = None) -> None:
-        _run(name, RunFolder(run), _kept(name, run), set_, jobs, scheduler)
+    def command(
+        run: Run, set_: Set = None, jobs: Jobs = None, scheduler: Scheduler = None, as_json: AsJson = False
+    ) -> None:
+        _run(name, RunFolder(run), _kept(name, run), set_, jobs, scheduler, as_json=as_json)
 
     command.__doc__ = f"Runs {name} with the configuration kept in the run folder."
     return command
@@ -80,10 +92,24 @@ def _run(
     set_: list[str] | None,
     jobs: int | None,
     scheduler: str | None,
+    *,
+    as_json: bool,
 ) -> None:
     configuration = resolve([*layers, ("command line", parse_overrides(set_ or [], MODELS))], MODELS)
     records = execute(folder, configuration, [name], jobs=jobs or usable_cores(), scheduler=scheduler)
-    typer.echo(records[name]["summary"])
+    typer.echo(json.dumps(_told(folder, name, records[name])) if as_json else records[name]["summary"])
+
+
+def _told(folder: RunFolder, name: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    """What a stage recorded, and the JSON files among its outputs by their names."""
+    files = sorted(file for output in record["outputs"] for file in folder.output(output).glob("*.json"))
+    told = ("summary", "items", "facts", "warnings", "seconds", "peak_memory_mib")
+    return {
+        "run": str(folder.root),
+        "stage": name,
+        **{key: record[key] for key in told},
+        **{file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files},
+    }
 
 
 pair, refine, depth, fuse, score = (_stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score"))

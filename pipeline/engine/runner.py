@@ -30,6 +30,8 @@ from schemas import TABLES
 
 # What changes no output, so that following a hint about it does not run the stage again.
 NOT_IN_KEY = frozenset({"max_failed_share"})
+# What a record tells of the machine rather than of the outputs.
+MEASURED = frozenset({"seconds", "peak_memory_mib"})
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -109,6 +111,9 @@ def _key_parts(stage: Stage, folder: RunFolder, configuration: Configuration) ->
         earlier = folder.record(upstream) or {}
         facts = {key: value for key, value in earlier.get("facts", {}).items() if key != earlier.get("place")}
         parts[f"facts of {upstream}"] = digest_json(facts)
+    for upstream in stage.records_of:
+        told = {key: value for key, value in (folder.record(upstream) or {}).items() if key not in MEASURED}
+        parts[f"record of {upstream}"] = digest_json(told)
     for name in stage.inputs:
         parts[name] = _input_digest(folder, name)
     return parts
@@ -148,6 +153,8 @@ def run_stage(
     # A dataset without a schema is of files that not every run has.
     for name in (name for name in stage.inputs if name.rstrip("/") in TABLES):
         if not folder.output(name).exists():
+            if name in stage.optional:
+                continue
             raise InputError(
                 "E-RUN-02",
                 f"{stage.name} needs {name}, which is not there",
@@ -285,6 +292,10 @@ class _StageContext:
             raise KeyError(f"{self.stage.name} does not declare that it reads the facts of {stage}")
         facts: Mapping[str, Any] = (self.folder.record(stage) or {}).get("facts", {})
         return facts
+
+    def records(self) -> Mapping[str, Mapping[str, Any]]:
+        found = {stage: self.folder.record(stage) for stage in self.stage.records_of}
+        return {stage: record for stage, record in found.items() if record is not None}
 
     def record(self, key: str, value: Any) -> None:
         self.facts_recorded[key] = value

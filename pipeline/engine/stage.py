@@ -48,6 +48,9 @@ class Context(Protocol):
     def facts(self, stage: str) -> Mapping[str, Any]:
         """What an earlier stage recorded with `record`."""
 
+    def records(self) -> Mapping[str, Mapping[str, Any]]:
+        """The records of the finished stages among `records_of`: configuration, outputs, facts, warnings, timings."""
+
     def record(self, key: str, value: Any) -> None:
         """Records a fact (JSON value) of this run in the manifest: an assumption made, a count, a source."""
 
@@ -120,9 +123,11 @@ class Stage:
         run: The work, from configuration and context to outputs; returns a line for people.
         reads: Keys of other stages' configuration it reads, "ingest.geoid".
         facts_of: Stages whose recorded facts it reads; those facts are part of its staleness key.
+        records_of: Stages whose whole records it reads; all but how long they took is part of its staleness key.
         sources: Files from outside the run folder that it reads; their bytes are part of its staleness key.
         foresee: Raises what the stage would refuse anyway, from configuration and the facts of ingest alone, so that a
             run is refused before the long stages and not after them.
+        optional: Inputs that a run may lack.
         place: The fact that tells where the sources lie, and how it follows from the configuration. The stage runs
             again when they moved, to tell it anew; later stages do not, for what they were made from is the same.
     """
@@ -135,6 +140,8 @@ class Stage:
     run: Callable[[Any, Context], str]
     reads: tuple[str, ...] = ()
     facts_of: tuple[str, ...] = ()
+    records_of: tuple[str, ...] = ()
     sources: Callable[[Any], Sequence[Path | str]] = field(default=no_sources)
     foresee: Callable[[Any, Callable[[str], Any], Mapping[str, Any]], None] = field(default=nothing_to_foresee)
+    optional: tuple[str, ...] = ()
     place: tuple[str, Callable[[Any], str]] | None = None

@@ -1,4 +1,4 @@
-"""Dense flow as a matcher: the best textured pixel of each cell of a grid, found in src by RAFT or DIS."""
+"""Dense flow as a matcher: the best textured pixel of each grid cell, or pixels asked for, found in src by RAFT or DIS."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.geometry.arrays import Floats
 from pipeline.geometry.poses import RelativePose
 from pipeline.matching.flow.estimators import FlowEstimator
 from pipeline.matching.flow.field import FlowSetting, dense_field
@@ -24,10 +25,12 @@ class DenseMatcher:
     Args:
         estimator: Of the flow.
         max_points: About how many points of an image.
+        asked_px: (n, 2) pixels of ref that are looked for instead of a grid's.
     """
 
     estimator: FlowEstimator
     max_points: int
+    asked_px: Floats | None = None
     extractor: None = None
 
     @property
@@ -41,7 +44,10 @@ class DenseMatcher:
         field = dense_field(
             FlowView(ref.image, ref.camera), FlowView(src.image, src.camera), pose, self.estimator, setting
         )
-        found = field.sample(grid_points(ref.image, self.max_points, limits.max_image_px))
+        asked = self.asked_px
+        if asked is None:
+            asked = grid_points(ref.image, self.max_points, limits.max_image_px)
+        found = field.sample(asked)
         rows = np.flatnonzero(found.valid & (found.discrepancy_px <= _LARGEST_DISCREPANCY_PX))
         ref_px, src_px, missed = found.ref_px[rows], found.src_px[rows], found.discrepancy_px[rows]
         each = np.arange(len(rows))

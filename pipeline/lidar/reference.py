@@ -18,7 +18,7 @@ _LEAST_REACH_PX = 4.0
 # The neighbours surround the pixel when their mean is not further off than this share of their own spread.
 _OFF_CENTRE = 0.75
 # Spread about the plane, in shares of the depth, beyond which the pixel is at an edge or on no surface.
-_LARGEST_SPREAD = 0.01
+LARGEST_SPREAD = 0.01
 # Neighbours nearly in one line of the image fix no plane.
 _LEAST_ROUNDNESS = 0.02
 
@@ -74,10 +74,10 @@ def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturn
     reach = np.maximum(_REACH_FOOTPRINTS * np.median(visible.footprint_px[near], axis=1), _LEAST_REACH_PX)
     close = distance[:, -1] <= reach
     rows, near = rows[close], near[close]
-    inverse, gradient, residual, sound = _plane_at_centre(
+    inverse, gradient, residual, sound = plane_at_centre(
         ideal_visible[near] - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
     )
-    sound &= (inverse > 0.0) & (residual <= _LARGEST_SPREAD * inverse)
+    sound &= (inverse > 0.0) & (residual <= LARGEST_SPREAD * inverse)
     rows, inverse, residual = rows[sound], inverse[sound], residual[sound]
     depth[rows] = 1.0 / inverse
     spread[rows] = residual / inverse**2
@@ -85,7 +85,7 @@ def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturn
     return Reference(depth, spread, slope, np.isfinite(depth))
 
 
-def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Floats, Bools]:
+def plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Floats, Bools]:
     """Least-squares affine function through neighbours, at offset zero.
 
     Args:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pyarrow as pa
@@ -36,6 +37,36 @@ class AlignedDepths:
     depth_m: Floats
     sigma_m: Floats
     kept: Bools
+
+    @staticmethod
+    def none(methods: tuple[str, ...]) -> AlignedDepths:
+        """No line."""
+        nobody, values = np.zeros(0, object), np.zeros((0, len(methods)))
+        return AlignedDepths(
+            methods, nobody, nobody, np.zeros((0, 2)), np.zeros(0), values, values, np.zeros(values.shape, np.bool_)
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[AlignedDepths]) -> AlignedDepths:
+        """The lines of several parts with the same methods, one after the other; at least one part."""
+        names = [field.name for field in fields(AlignedDepths) if field.name != "methods"]
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        return AlignedDepths(parts[0].methods, *columns)
+
+    def with_methods(self, names: tuple[str, ...], depth_m: Floats) -> AlignedDepths:
+        """The same lines with further methods, which tell no sigma and keep every depth they have.
+
+        Args:
+            names: Of the methods.
+            depth_m: (n, len(names)) m; NaN where a method has none.
+        """
+        return replace(
+            self,
+            methods=(*self.methods, *names),
+            depth_m=np.concatenate([self.depth_m, depth_m], axis=1),
+            sigma_m=np.concatenate([self.sigma_m, np.full(depth_m.shape, np.nan)], axis=1),
+            kept=np.concatenate([self.kept, usable(depth_m, np.ones(depth_m.shape, np.bool_))], axis=1),
+        )
 
     def where(self, rows: AnyArray) -> AlignedDepths:
         """The lines of some rows."""

@@ -1,4 +1,4 @@
-"""Dense flow as a matcher: the best textured pixel of each grid cell, or pixels asked for, found in src by RAFT or DIS."""
+"""Dense flow as a matcher: the best textured pixel of each grid cell, or any asked for, found in src by RAFT or DIS."""
 
 from __future__ import annotations
 

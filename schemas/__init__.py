@@ -12,6 +12,7 @@ from schemas.pose_covariances import POSE_COVARIANCES
 from schemas.poses import POSES
 from schemas.relative_poses import RELATIVE_POSES
 from schemas.scores import SCORES
+from schemas.sensitivity import CURVES
 from schemas.tracks import TRACKS
 
 TABLES: dict[str, TableSchema] = {
@@ -30,12 +31,14 @@ TABLES: dict[str, TableSchema] = {
         DEPTHS,
         POINTS,
         SCORES,
+        CURVES,
     )
 }
 
 __all__ = [
     "CAMERAS",
     "CLOCKS",
+    "CURVES",
     "DEPTHS",
     "FRAMES",
     "MATCHES",

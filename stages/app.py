@@ -25,6 +25,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "depth": ("stages.stage_command", "depth", "Sparse depth by epipolar transfer, with sigma."),
     "fuse": ("stages.stage_command", "fuse", "Georeferenced points with covariance."),
     "score": ("stages.stage_command", "score", "Depths against LiDAR tiles, or a bag's own sweeps."),
+    "sensitivity": (
+        "stages.stage_command",
+        "sensitivity",
+        "What errors of the logged pose do to the depths.",
+    ),
     "export": ("stages.export", "command", "Points in another format: laz, las, ply, gpkg, csv, parquet."),
     "example": ("stages.example", "command", "Write a small synthetic flight with its truth."),
     "inspect": ("stages.inspect", "command", "Tell what photos, logs, bags, tiles or tables hold."),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.engine.stage import Stage, StageConfig
-from stages import depth, fuse, ingest, match, pair, refine, score
+from stages import depth, fuse, ingest, match, pair, refine, score, sensitivity
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -15,7 +15,11 @@ STAGES: dict[str, Stage] = {
         depth.STAGE,
         fuse.STAGE,
         score.STAGE,
+        sensitivity.STAGE,
     )
 }
 
 MODELS: dict[str, type[StageConfig]] = {name: stage.config for name, stage in STAGES.items()}
+
+# What a run without a workflow leaves out: it needs a truth, or has to be asked for.
+ON_REQUEST = frozenset({"score", "sensitivity"})

@@ -14,7 +14,7 @@ from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
 from stages.options import Device, Jobs, Scheduler, Set, on_device
-from stages.registry import MODELS, STAGES
+from stages.registry import MODELS, ON_REQUEST, STAGES
 from stages.workflow import chosen_stages, execute
 
 
@@ -81,7 +81,7 @@ def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None
             expected="WORKFLOW.toml, --photos DIR, --bags FILE or --videos FILE",
             hint="epitransfer run --help",
         )
-    sections: Sections = {name: {} for name in STAGES if name != "score" or lidar}
+    sections: Sections = {name: {} for name in STAGES if name not in ON_REQUEST}
     sections["ingest"] = {key: value for key, value in ingest.items() if value}
     if lidar:
         sections["score"] = {"lidar": lidar}

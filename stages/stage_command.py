@@ -14,7 +14,7 @@ from pipeline.engine.errors import UsageError
 from pipeline.engine.executors import usable_cores
 from pipeline.engine.runfolder import RunFolder
 from stages.options import Device, Jobs, Scheduler, Set, on_device
-from stages.registry import MODELS, STAGES
+from stages.registry import MODELS, ON_REQUEST, STAGES
 from stages.workflow import execute, kept_sections
 
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
@@ -50,7 +50,7 @@ def ingest(
     elif not (photos or bags or videos) or folder.workflow.exists():
         layers.append(("run folder", kept_sections(folder)))
     else:
-        layers.append(("default", {name: {} for name in STAGES if name != "score"}))
+        layers.append(("default", {name: {} for name in STAGES if name not in ON_REQUEST}))
     named = {"photos": photos, "logs": logs, "bags": bags, "videos": videos, "camera": camera}
     given = {key: value for key, value in named.items() if value}
     layers.append(("command line", absolute_paths({"ingest": given}, MODELS, Path.cwd())))
@@ -112,4 +112,6 @@ def _told(folder: RunFolder, name: str, record: Mapping[str, Any]) -> dict[str, 
     }
 
 
-pair, refine, depth, fuse, score = (_stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score"))
+pair, refine, depth, fuse, score, sensitivity = (
+    _stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score", "sensitivity")
+)

@@ -21,7 +21,7 @@ from schemas import TABLES
 
 RECORD = "record.json"
 FAILURE = "failure.txt"
-DATASETS = frozenset({"matches", "depths", "points", "scores", "images", "sweeps", "report"})
+DATASETS = frozenset({"matches", "depths", "points", "scores", "images", "sweeps", "report", "sensitivity"})
 
 
 class RunFolder:

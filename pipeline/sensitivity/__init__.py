@@ -1,0 +1,1 @@
+"""What injected errors of the logged pose do to the depths."""

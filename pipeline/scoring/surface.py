@@ -1,0 +1,77 @@
+"""The surface that returns stand for, at points near it: a plane through the nearest ones, where they make one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.arrays import Bools, Floats
+
+NEIGHBOURS = 8
+"""Returns that a plane is fitted to: three unknowns, and enough over to see that it is no plane."""
+
+# No return used may be further from the point's foot than this many distances between returns.
+_REACH_SPACINGS = 2.5
+# The returns surround the foot when their mean is not further off than this share of their own spread.
+_OFF_CENTRE = 0.75
+# Returns nearly in one line fix no plane.
+_LEAST_ROUNDNESS = 0.02
+# Spread about the plane beyond which it is none: a share of the returns' lesser extent, but no less than LiDAR's noise.
+_LARGEST_SPREAD, _NOISE_M = 0.15, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The surface near points.
+
+    Args:
+        nearest_m: (n,) distance to the nearest return, m.
+        signed_m: (n,) how far the point lies above the plane of the nearest returns along its normal, m.
+        normal: (n, 3) the plane's, ENU, pointing up.
+        sound: (n,) whether these returns make a surface: planar, and all around the point's foot.
+    """
+
+    nearest_m: Floats
+    signed_m: Floats
+    normal: Floats
+    sound: Bools
+
+    @property
+    def distance_m(self) -> Floats:
+        """(n,) to the surface; where there is none, to the nearest return, which is an upper bound."""
+        return np.where(self.sound, np.abs(self.signed_m), self.nearest_m)
+
+
+def surface_at(
+    points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree, spacing_m: float, neighbours: int = NEIGHBOURS
+) -> Surface:
+    """The surface near points.
+
+    Args:
+        points_in_enu_m: (n, 3) ENU, m.
+        returns_in_enu_m: (m, 3) ENU, m; m >= neighbours.
+        tree: Of the returns.
+        spacing_m: Between neighbouring returns, m.
+        neighbours: Returns that a plane is fitted to.
+    """
+    distance, rows = (np.asarray(found) for found in tree.query(points_in_enu_m, k=neighbours))
+    near = returns_in_enu_m[rows]
+    centre = near.mean(axis=1)
+    centred = near - centre[:, None, :]
+    value, vector = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred) / neighbours)
+    normal = vector[:, :, 0] * np.where(vector[:, 2, 0] < 0.0, -1.0, 1.0)[:, None]
+    offset = points_in_enu_m - centre
+    signed = np.einsum("ni,ni->n", offset, normal)
+    aside = offset - signed[:, None] * normal
+    foot = centre + aside
+    extent = value[:, 1] + value[:, 2]
+    spread = np.sqrt(np.maximum(value[:, 0], 0.0) * neighbours / (neighbours - 3))
+    # A disc of so many more returns is so much wider.
+    reach = _REACH_SPACINGS * spacing_m * np.sqrt(neighbours / NEIGHBOURS)
+    sound: Bools = spread <= np.maximum(_LARGEST_SPREAD * np.sqrt(np.maximum(value[:, 1], 0.0)), _NOISE_M)
+    sound &= value[:, 1] * value[:, 2] > (_LEAST_ROUNDNESS * extent) ** 2
+    sound &= np.einsum("ni,ni->n", aside, aside) <= _OFF_CENTRE**2 * extent
+    sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= reach
+    return Surface(distance[:, 0], signed, normal, sound)

@@ -30,6 +30,11 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "sensitivity",
         "What errors of the logged pose do to the depths.",
     ),
+    "report": (
+        "stages.stage_command",
+        "report",
+        "What was flown, what came out, how good, what to distrust: a page.",
+    ),
     "export": ("stages.export", "command", "Points in another format: laz, las, ply, gpkg, csv, parquet."),
     "example": ("stages.example", "command", "Write a small synthetic flight with its truth."),
     "inspect": ("stages.inspect", "command", "Tell what photos, logs, bags, tiles or tables hold."),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.engine.stage import Stage, StageConfig
-from stages import depth, fuse, ingest, match, pair, refine, score, sensitivity
+from stages import depth, fuse, ingest, match, pair, refine, report, score, sensitivity
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -16,6 +16,7 @@ STAGES: dict[str, Stage] = {
         fuse.STAGE,
         score.STAGE,
         sensitivity.STAGE,
+        report.STAGE,
     )
 }
 

@@ -112,6 +112,6 @@ def _told(folder: RunFolder, name: str, record: Mapping[str, Any]) -> dict[str, 
     }
 
 
-pair, refine, depth, fuse, score, sensitivity = (
-    _stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score", "sensitivity")
+pair, refine, depth, fuse, score, sensitivity, report = (
+    _stage_command(name) for name in ("pair", "refine", "depth", "fuse", "score", "sensitivity", "report")
 )

@@ -104,7 +104,7 @@ def point_counts(run: RunData) -> PointCounts:
     spreads: list[list[Spread]] = [[Spread.of(np.empty(0))] for _ in range(5)]
     cells: set[tuple[int, int]] = set()
     n = 0
-    for table in _pieces(run.points):
+    for table in _pieces(run.paths.get("points")):
         n += table.num_rows
         at = np.unique(np.floor(columns(table, ("x", "y")) / cell).astype(np.int64), axis=0)
         cells.update(map(tuple, at.tolist()))
@@ -113,8 +113,8 @@ def point_counts(run: RunData) -> PointCounts:
     return PointCounts(n, len(cells) * cell**2, *(into[0] for into in spreads))
 
 
-def _pieces(folder: Path) -> Iterator[pa.Table]:
-    for file in parquet_files(folder):
+def _pieces(folder: Path | None) -> Iterator[pa.Table]:
+    for file in parquet_files(folder) if folder else []:
         with pq.ParquetFile(file, arrow_extensions_enabled=False) as stored:
             for batch in stored.iter_batches(columns=list(_POINT_COLUMNS)):
                 yield pa.Table.from_batches([batch])

@@ -235,7 +235,7 @@ def _coverage(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     if numbers["how_good"] is None or not matches or met is None:
         return
     if (unseen := 1.0 - met / matches) > UNSEEN_SHARE:
-        text = f"{unseen:.0%} of the matches have no reference (out of range, hidden, off the LiDAR): nothing is known of them"
+        text = f"{unseen:.0%} of the matches have no reference (out of range, hidden or off the LiDAR)"
         yield Doubt("coverage", KNOW, text)
 
 

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 LABELS = {
     "epitransfer": "EpiTransfer",
-    "epitransfer-lateral": "EpiTransfer, lateral view",
-    "epitransfer-vertical": "EpiTransfer, vertical view",
     "dlt": "Triangulation (DLT)",
     "zoedepth": "ZoeDepth",
     "depth-anything-v2": "Depth Anything V2",
+    "epitransfer-lateral": "EpiTransfer, lateral view",
+    "epitransfer-vertical": "EpiTransfer, vertical view",
 }
 _COLOURS = {
     "epitransfer": "#2f7fd1",
@@ -20,6 +20,7 @@ _COLOURS = {
     "epitransfer-lateral": "#8ab4e0",
     "epitransfer-vertical": "#5b93a8",
 }
+TAKES = ("#2f7fd1", "#e0822b", "#2f9e77", "#b562b8", "#c9a227", "#5b93a8", "#7b86d6", "#a0703c")
 _SPARE = ("#c9a227", "#d1556b", "#7b86d6", "#8f9aa3")
 GOOD, BAD, QUIET = "#2f9e77", "#d1556b", "#8f9aa3"
 
@@ -27,6 +28,12 @@ GOOD, BAD, QUIET = "#2f9e77", "#d1556b", "#8f9aa3"
 def label(method: str) -> str:
     """What a method is called in the report."""
     return LABELS.get(method, method)
+
+
+def in_order(methods: Iterable[str]) -> list[str]:
+    """Methods in the paper's order, then those it does not have."""
+    known = list(LABELS)
+    return sorted(methods, key=lambda name: (known.index(name) if name in known else len(known), name))
 
 
 def colours(methods: Iterable[str]) -> dict[str, str]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.reporting.gathered import RunData
+from pipeline.reporting.palette import in_order
 
 
 def untrained(run: RunData) -> frozenset[str]:
@@ -32,7 +33,7 @@ def quality(run: RunData) -> dict[str, Any] | None:
     return {
         "truth": metrics.get("truth"),
         "published": calibration.get("method") or next(iter(metrics["methods"]), None),
-        "methods": [_method(name, entry, name in random) for name, entry in metrics["methods"].items()],
+        "methods": [_method(name, metrics["methods"][name], name in random) for name in in_order(metrics["methods"])],
         "map": metrics.get("map"),
         "checkpoints": metrics.get("checkpoints"),
         "calibration": {

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.reporting.gathered import RunData
-from pipeline.reporting.palette import label
+from pipeline.reporting.palette import in_order, label
 
-MISSING = "–"
+MISSING = "\N{EN DASH}"
 # The paper's rows in the paper's order: metric, words, whether less is better.
 METRICS = (
     ("abs_rel", "AbsRel", True),
@@ -84,8 +84,10 @@ def _both(methods: Mapping[str, Any], untrained: frozenset[str], what: str) -> I
 
 
 def _paper_table(methods: Mapping[str, Any], which: str, caption: str, untrained: frozenset[str]) -> Table:
+    methods = {name: methods[name] for name in in_order(methods)}
     head = ("Metric", *(label(name) + (" (random weights)" if name in untrained else "") for name in methods))
-    rows, strong = [], set()
+    rows: list[tuple[str, ...]] = []
+    strong: set[tuple[int, int]] = set()
     for key, words, less in METRICS:
         values = {name: entry[which][key] for name, entry in methods.items()}
         bounds = {name: ((e.get("interval_95") or {}).get(which) or {}).get(key) for name, e in methods.items()}
@@ -116,7 +118,7 @@ def checkpoint_table(checkpoints: Mapping[str, Any] | None) -> Table | None:
     ]
     mean = checkpoints.get("mean_m") or (None, None, None)
     rows.append(("Mean", *(_signed(e) for e in mean), "", "", "", ""))
-    head = ("Checkpoint", *(f"Error {axis} (m)" for axis in "ENU"), *(f"σ {axis} (m)" for axis in "ENU"), "Rays")
+    head = ("Checkpoint", *(f"Error {axis} (m)" for axis in "ENU"), *(f"Sigma {axis} (m)" for axis in "ENU"), "Rays")
     return Table("Errors at the checkpoints", head, tuple(rows), str(checkpoints.get("statement") or ""))
 
 

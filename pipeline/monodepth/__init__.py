@@ -1,0 +1,1 @@
+"""Learned baselines: metric depth of single images, which knows no pose."""

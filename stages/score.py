@@ -1,34 +1,25 @@
-"""score: the depths of every method beside LiDAR, on the same pixels."""
+"""score: the depths of every method beside what something else measured, on the same pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context, Stage, StageConfig
-from pipeline.flight import camera_by_frame, cameras_of, covariances_of, placements_of
-from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
-from pipeline.lidar.nearby import LocalTiles
-from pipeline.lidar.tiles import expand, read_local_tile, read_tile
-from pipeline.lidar.visibility import View
-from pipeline.scoring.frame_scores import FrameScore, ScoringJob, score_frames
-from pipeline.scoring.lines import SparseLines, frames_in, methods_of
-from pipeline.scoring.refusals import apart, check_datums, no_reference, nothing_to_score_against
+from pipeline.lidar.tiles import expand
+from pipeline.scoring.believed import Believed, depth_images, survey
+from pipeline.scoring.collecting import collect
+from pipeline.scoring.frame_scores import FrameScore, ScoringJob
+from pipeline.scoring.inputs import DENSE_READS, TilesNamed, dense_lines, sparse_lines, views_of
+from pipeline.scoring.lines import frames_in
 from pipeline.scoring.summary import metrics_object, sentence, to_json
-from pipeline.scoring.truth import FrameView, Survey
-from schemas import SCORES
-
-_FRAMES_PER_SHARD = 8
+from pipeline.scoring.truth import FrameView
+from pipeline.sources.depth_images import SUFFIXES
+from pipeline.sources.files import find, is_url
 
 
 class Config(StageConfig):
@@ -45,120 +36,88 @@ class Config(StageConfig):
         description="What the heights are measured from in tiles whose CRS does not say: ellipsoidal, egm96, egm2008, "
         "navd88 (in m), or the code of a vertical CRS, which carries its unit (EPSG:6360)",
     )
+    depth_images: str | None = Field(
+        None,
+        description="Depth images of the photos, 16 bits along the optical axis, instead of LiDAR: a folder or glob",
+        json_schema_extra={"path": True},
+    )
+    depth_units_per_m: float = Field(
+        1000.0, gt=0.0, description="Units of a depth image's values in a metre: 1000 for 7-Scenes, 5000 for TUM (1/m)"
+    )
     max_range_m: float = Field(100.0, gt=0.0, description="Largest distance from the camera that is scored (m)")
-    correspondence: Literal["sparse"] = Field("sparse", description="Pixels compared: sparse, those of the matches")
+    correspondence: Literal["sparse", "dense"] = Field(
+        "sparse",
+        description="Pixels compared: sparse, those of the matches, which are delivered; dense, those where the truth "
+        "was measured, matched by optical flow as in the paper",
+    )
+    dense_matcher: Literal["dis", "raft"] = Field("dis", description="Optical flow of dense")
+    dense_points: int = Field(2000, ge=8, description="Most pixels of a frame that dense asks for (1)")
+
+    @model_validator(mode="after")
+    def _as_a_whole(self) -> Config:
+        if self.lidar is not None and self.depth_images is not None:
+            raise ValueError("lidar and depth_images are two truths: score against one, then against the other")
+        return self
 
 
 def run(config: Config, context: Context) -> str:
-    """Scores `depths` against the tiles; writes `scores/metrics.json` and `scores/pixels.parquet`."""
+    """Scores `depths` against the truth; writes `scores/metrics.json` and `scores/pixels.parquet`."""
     depths, folder = context.path("depths"), context.output("scores")
-    tiles = _tiles(config, context)
-    context.record("lidar", "the run's own sweeps" if config.lidar is None else "tiles named")
-    views = _views(context, frames_in(depths))
+    views = views_of(context, frames_in(depths))
     if not views:
         raise NothingLeftError("E-SCORE-05", "no depth to score", where=str(depths), hint="see what depth masked")
-    centres = np.array([item.view.centre_in_enu_m for item in views])
-    meeting = tiles.meeting(centres, config.max_range_m)
-    if not meeting:
-        raise apart(tiles, centres, config.max_range_m)
-    lines = SparseLines(depths, methods_of(depths, context.setting("depth.methods")[0]))
-    job = ScoringJob(Survey(replace(tiles, tiles=meeting), config.max_range_m), lines)
-    scores: list[FrameScore] = []
-    with pq.ParquetWriter(folder / "pixels.parquet", SCORES.arrow(), compression="zstd") as writer:
-        shards = context.map(partial(score_frames, job), views, shard=_FRAMES_PER_SHARD, label="frames")
-        for table, part in shards:
-            writer.write_table(_checked(table))
-            scores += part
-    metrics = metrics_object(lines.methods, scores)
-    _tell(context, scores, tiles, meeting)
-    if not any(score.sums.methods[0].n_scored for score in scores):
-        raise no_reference(
-            sum(score.n_matches for score in scores),
-            sum(score.n_visible for score in scores),
-            tiles,
-            config.max_range_m,
-        )
+    believed = _believed(config, context, views)
+    dense = config.correspondence == "dense"
+    lines = dense_lines(context, config.dense_matcher, config.dense_points) if dense else sparse_lines(context)
+    shard = _SLOW_FRAMES_PER_SHARD if dense else _FRAMES_PER_SHARD
+    job = ScoringJob(believed.truth, lines, config.max_range_m, shard=shard)
+    scores = collect(context, job, views, folder)
+    _tell(context, scores[0])
+    if not any(score.sums.methods[0].n_scored for score in scores[0]):
+        raise believed.nothing(scores[0])
+    metrics = metrics_object(job.methods, scores[0])
     (folder / "metrics.json").write_text(to_json(metrics), encoding="utf-8")
     return sentence(metrics)
 
 
-def _checked(table: pa.Table) -> pa.Table:
-    SCORES.check(table)
-    return table
+def _believed(config: Config, context: Context, views: Sequence[FrameView]) -> Believed:
+    if config.depth_images is not None:
+        return depth_images(context, config.depth_images, config.depth_units_per_m, config.max_range_m)
+    return survey(context, _tiles(config), views, config.max_range_m, 0.0)
 
 
-def _tiles(config: Config, context: Context) -> LocalTiles:
-    """The tiles' headers, and the frame they are brought into."""
-    facts = context.facts("ingest")
-    if config.lidar is None:
-        return LocalTiles(tuple(map(read_local_tile, _sweeps(context.path("sweeps")))))
-    if _is_local(facts):
-        return LocalTiles(tuple(map(read_local_tile, expand(config.lidar))))
-    frames = context.read("frames")
-    datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
-    check_datums(datums)
-    origin = facts["origin"]
-    frame = LocalFrame(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
-    tiles = tuple(read_tile(path, config.lidar_height_datum) for path in expand(config.lidar))
-    return LocalTiles(tiles, frame, context.setting("ingest.geoid"), datums[0])
+def _tiles(config: Config) -> TilesNamed:
+    return TilesNamed(config.lidar, config.lidar_height_datum)
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:
-    """Refuses heights that cannot meet LiDAR's, tiles that cannot be read or placed, and having no reference at all."""
+    """Refuses heights that cannot meet LiDAR's, truth that cannot be read or placed, and having none at all."""
     del setting
-    if config.lidar is None:
-        if not facts.get("sweep_points"):
-            raise nothing_to_score_against()
-        return
-    if not _is_local(facts):
-        check_datums([facts["height_datum"]])
-    for path in expand(config.lidar):
-        read_local_tile(path) if _is_local(facts) else read_tile(path, config.lidar_height_datum)
+    if config.depth_images is not None:
+        find(config.depth_images, SUFFIXES)
+    else:
+        _tiles(config).foresee(facts)
 
 
-def _is_local(facts: Mapping[str, Any]) -> bool:
-    return bool(facts.get("world", EARTH) == LOCAL_WORLD)
-
-
-def _sweeps(folder: Path) -> tuple[Path, ...]:
-    """The tiles of the run's own sweeps, which are in the run's frame."""
-    tiles = tuple(sorted(folder.rglob("*.laz")))
-    if not tiles:
-        raise nothing_to_score_against()
-    return tiles
-
-
-def _views(context: Context, wanted: set[str]) -> list[FrameView]:
-    """The frames that have depths, in the order of `poses`."""
-    cameras = camera_by_frame(context.read("frames"), cameras_of(context.read("refined_cameras")))
-    poses = context.read("poses")
-    covariances = covariances_of(poses)
-    return [
-        FrameView(frame_id, View(cameras[frame_id], pose.centre, pose.rotation), covariances[frame_id])
-        for frame_id, pose in placements_of(poses).items()
-        if frame_id in wanted
-    ]
-
-
-def _tell(context: Context, scores: Sequence[FrameScore], tiles: LocalTiles, meeting: Sequence[object]) -> None:
+def _tell(context: Context, scores: Sequence[FrameScore]) -> None:
     """Records what the figures rest on."""
     blind = [score.frame_id for score in scores if not score.n_visible]
     context.count_items(len(scores), 0)
-    context.record("lidar_tiles", {"given": len(tiles.tiles), "used": len(meeting)})
-    context.record("lidar_heights", sorted({tiles.transform(tile).height_note for tile in tiles.tiles}))
     context.record("matches", sum(score.n_matches for score in scores))
     context.record("matches_with_reference", sum(score.sums.methods[0].n_scored for score in scores))
-    context.record("frames_that_see_no_lidar", blind)
+    context.record("frames_that_see_no_truth", blind)
     context.record(
         "calibration_sigma",
         "predicted sigma, the reference's spread and what the pose's sigma makes of it, in quadrature",
     )
     if blind:
-        context.warn(f"{len(blind)} of {len(scores)} frames see no LiDAR return, {blind[0]} among them")
+        context.warn(f"{len(blind)} of {len(scores)} frames see nothing of the truth, {blind[0]} among them")
 
 
-def sources(config: Config) -> tuple[Path, ...]:
-    """The tiles, whose bytes are part of the stage's staleness key; the run's own sweeps are an input like others."""
+def sources(config: Config) -> tuple[Path | str, ...]:
+    """The truth's files, whose bytes are part of the stage's staleness key; the run's own sweeps are an input."""
+    if config.depth_images is not None:
+        return tuple(name if is_url(name) else Path(name) for name in find(config.depth_images, SUFFIXES))
     return () if config.lidar is None else expand(config.lidar)
 
 
@@ -166,10 +125,10 @@ STAGE = Stage(
     "score",
     3,
     Config,
-    ("frames", "refined_cameras", "poses", "depths", "sweeps"),
+    ("frames", "refined_cameras", "poses", "pairs", "relative_poses", "depths", "images", "sweeps"),
     ("scores",),
     run,
-    reads=("ingest.geoid", "depth.methods"),
+    reads=("ingest.geoid", "depth.methods", *DENSE_READS),
     facts_of=("ingest",),
     sources=sources,
     foresee=foresee,

@@ -2,18 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
 
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Bools, Floats
 from pipeline.scoring.depth_rows import AlignedDepths
 from pipeline.scoring.frame_sums import FrameSums, Scored
-from pipeline.scoring.lines import Lines
-from pipeline.scoring.truth import FrameTruth, FrameView, Truth
+from pipeline.scoring.lines import Lines, NearLines
+from pipeline.scoring.truth import FrameTruth, FrameView, NearTruth, Truth
 from schemas import SCORES
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """The one constant translation that control points ask for, and what they must not be scored on.
+
+    Args:
+        translation_m: (3,) by which the truth is shifted, ENU.
+        covariance: (3, 3) of it, m^2.
+        excluded: From pixels (n, 2) and frame_id to whether they lie on a control point.
+    """
+
+    translation_m: Floats
+    covariance: Floats
+    excluded: Callable[[Floats, str], Bools]
+
+
+@dataclass(frozen=True, slots=True)
+class Baselines:
+    """Methods that look at one image alone.
+
+    Args:
+        names: Of the methods.
+        images: Where the frames' images lie.
+        depths_at: From an image's location and pixels (n, 2) to depths (n,) m by name, NaN for none.
+    """
+
+    names: tuple[str, ...]
+    images: Mapping[str, str]
+    depths_at: Callable[[str, Floats], Mapping[str, Floats]]
+
+    def beside(self, lines: AlignedDepths, frame_id: str) -> AlignedDepths:
+        """The lines of a frame with these methods beside the others."""
+        if not self.names:
+            return lines
+        found = self.depths_at(self.images[frame_id], lines.pixels) if len(lines.pixels) else {}
+        nothing = np.full(len(lines.pixels), np.nan)
+        return lines.with_methods(self.names, np.stack([found.get(name, nothing) for name in self.names], axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +61,25 @@ class ScoringJob:
     Args:
         truth: What depths are held against.
         lines: The depths.
+        max_range_m: Largest Euclidean distance from the camera that is scored, m.
+        baselines: Further methods.
+        correction: Where there are control points.
+        shard: Frames that are scored together.
+        here: Whether a device does the work, and not the cores.
     """
 
     truth: Truth
     lines: Lines
+    max_range_m: float
+    baselines: Baselines | None = None
+    correction: Correction | None = None
+    shard: int = 8
+    here: bool = False
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Every method, the published one first."""
+        return self.lines.methods + (self.baselines.names if self.baselines else ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +99,20 @@ class FrameScore:
     sums: FrameSums
 
 
-def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table, list[FrameScore]]:
+@dataclass(frozen=True, slots=True)
+class ShardScores:
+    """Scores of some frames against one placing of the truth.
+
+    Args:
+        pixels: Rows of the table `pixels`.
+        frames: One score per frame.
+    """
+
+    pixels: pa.Table
+    frames: list[FrameScore]
+
+
+def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> list[ShardScores]:
     """Scores some frames; memory grows with the truth near them, not with the flight.
 
     Args:
@@ -54,31 +120,56 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> tuple[pa.Table,
         items: The frames.
 
     Returns:
-        Rows of the table `pixels`, and one score per frame.
+        The scores that stand first; with a correction these are the corrected ones, and those without it follow. Both
+        leave out what lies on control points.
 
     Raises:
-        InputError: The truth is damaged, or the rows of `depths` do not belong together.
+        InputError: The truth is damaged, an image cannot be read, or the rows of `depths` do not belong together.
         UndeterminedError: A height datum or the geoid between two is not known.
     """
-    lines, near = job.lines.near(items), job.truth.near(items)
+    near, lines = job.truth.near(items), job.lines.near(items)
+    if job.correction is None:
+        return [_against(job, near, lines, items)]
+    corrected = [_corrected(item, job.correction) for item in items]
+    moved = near.moved(job.correction.translation_m)
+    return [_against(job, moved, lines, corrected), _against(job, near, lines, items)]
+
+
+def _against(job: ScoringJob, near: NearTruth, lines: NearLines, items: Sequence[FrameView]) -> ShardScores:
     tables, scores = [], []
     for item in items:
         seen = near.seen_by(item)
         mine = lines.of(item, seen)
-        scored = _scored(item, seen, mine)
-        scores.append(FrameScore(item.frame_id, len(mine.pixels), len(seen.depth_m), FrameSums.of(scored)))
+        scored = _scored(job, item, seen, mine)
+        sums = FrameSums.of(scored, job.max_range_m)
+        scores.append(FrameScore(item.frame_id, len(mine.pixels), len(seen.depth_m), sums))
         tables.append(_table(scored))
-    return pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores
+    return ShardScores(pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores)
 
 
-def _scored(item: FrameView, seen: FrameTruth, mine: AlignedDepths) -> Scored:
-    """The pixels that have a reference."""
+def _corrected(item: FrameView, correction: Correction) -> FrameView:
+    """The frame with the error that its place has once the truth is shifted: that of the shift.
+
+    What all frames' places have in common is gone with it, and it is by far the larger part.
+    """
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = item.covariance[:3, :3], correction.covariance
+    return replace(item, covariance=covariance)
+
+
+def _scored(job: ScoringJob, item: FrameView, seen: FrameTruth, mine: AlignedDepths) -> Scored:
+    """The pixels that have a reference, with every method."""
     reference = seen.reference_at(mine.pixels)
-    has = np.flatnonzero(reference.valid)
+    valid = reference.valid
+    if job.correction is not None:
+        valid = valid & ~job.correction.excluded(mine.pixels, item.frame_id)
+    has = np.flatnonzero(valid)
     lines, found = mine.where(has), reference.where(has)
+    by_pose = seen.pose_sigma(lines.pixels, found)
+    if job.baselines is not None:
+        lines = job.baselines.beside(lines, item.frame_id)
     camera = item.view.camera
     rays: Floats = camera.rays(lines.pixels) @ item.view.rotation_enu_from_cam.T
-    by_pose = seen.pose_sigma(lines.pixels, found)
     return Scored(lines, found, by_pose, rays, (camera.width, camera.height))
 
 

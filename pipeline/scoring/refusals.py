@@ -18,7 +18,7 @@ def nothing_to_score_against() -> UsageError:
     return UsageError(
         "E-SCORE-06", "there is nothing to score against", where="score.lidar",
         found="no tiles named, and no LiDAR sweeps in the run", expected="LAS, LAZ or COPC tiles, or a bag with sweeps",
-        hint="--set score.lidar=TILES, or take the section [score] out of the workflow",
+        hint="--set score.lidar=TILES (or score.depth_images=FOLDER), or take the section [score] out of the workflow",
     )  # fmt: skip
 
 
@@ -82,6 +82,23 @@ def no_reference(n_matches: int, n_visible: int, tiles: LocalTiles, max_range_m:
         "E-SCORE-04", "no match has a reference depth",
         found=f"{n_matches:,} matches; the frames see {n_visible:,} LiDAR returns within {max_range_m:g} m",
         expected="returns on the surfaces that are matched", hint=f"see {doubt}, or raise score.max_range_m",
+    )  # fmt: skip
+
+
+def no_depth_seen(location: str, frame_id: str, n_measured: int, units_per_metre: float) -> NothingLeftError:
+    """Depth images have nothing at the pixels that are compared.
+
+    Args:
+        location: Of the depth images.
+        frame_id: The first frame.
+        n_measured: Places where one of them was measured.
+        units_per_metre: Of their values.
+    """
+    return NothingLeftError(
+        "E-SCORE-07", "no match has a reference depth", where=location,
+        found=f"{n_measured:,} measured places of all frames, read with {units_per_metre:g} units in a metre",
+        expected=f"depths within score.max_range_m where photos have matches ({frame_id} and others)",
+        hint="see score.depth_units_per_m, and that the images are registered to the photos",
     )  # fmt: skip
 
 

@@ -5,29 +5,46 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import NormalDist
 
 import numpy as np
 
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Floats, Ints
+
+NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+# How many sigmas are the bound of each count: of one and two sigma, and of each nominal share of a Gaussian.
+_BOUNDS = (1.0, 2.0, *(NormalDist().inv_cdf(0.5 + 0.5 * p) for p in NOMINAL))
+# Bins of the predicted relative sigma.
+SIGMA_EDGES = (0.0, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, math.inf)
+# Errors in sigmas are counted in bins of an eighth of an octave, from which their median follows.
+_PER_OCTAVE = 8
+_OCTAVES = 8
+_HISTOGRAM = 2 * _OCTAVES * _PER_OCTAVE
+_MEDIAN_OF_GAUSSIAN = NormalDist().inv_cdf(0.75)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSums:
-    """Counts of errors within one and two predicted sigmas.
+    """Counts and sums of errors in units of their predicted sigma.
 
     Args:
         n: Pixels with a predicted sigma.
-        within_1: Those whose error is at most one sigma.
-        within_2: Those whose error is at most two.
+        within: (12,) those whose error is at most one and two sigmas, and at most the bound of each nominal share.
+        squares: Sum of squared errors in sigmas.
+        histogram: (128,) counts of errors in sigmas, 2^-8 to 2^8; what is beyond is in the first or last bin.
+        by_sigma: (15, 3) pixels and sums of the squared relative sigma and error, by bins of the relative sigma.
     """
 
     n: int
-    within_1: int
-    within_2: int
+    within: Ints
+    squares: float
+    histogram: Ints
+    by_sigma: Floats
 
     @staticmethod
     def of(depth_m: Floats, sigma_m: Floats, reference_m: Floats, spread_m: Floats) -> CalibrationSums:
-        """Counts over one set of pixels.
+        """Counts and sums over one set of pixels.
 
         The error has two parts: the depth's, which sigma predicts, and the reference's own, of which the spread of the
         returns about their surface is the measure. They are added in quadrature.
@@ -38,23 +55,85 @@ class CalibrationSums:
             reference_m: (n,) reference depths, m.
             spread_m: (n,) spread of the reference, m.
         """
-        has = np.isfinite(sigma_m)
-        error = np.abs(depth_m[has] - reference_m[has])
-        sigma = np.hypot(sigma_m[has], spread_m[has])
-        return CalibrationSums(int(has.sum()), int((error <= sigma).sum()), int((error <= 2.0 * sigma).sum()))
+        total = np.hypot(sigma_m, spread_m)
+        has = np.isfinite(total) & (total > 0.0)
+        depth, sigma = depth_m[has], total[has]
+        error = np.abs(depth - reference_m[has])
+        # Of the estimated depth, as the sigma is: it is what is known where there is no reference.
+        predicted, observed = sigma / depth, error / depth
+        place = np.searchsorted(SIGMA_EDGES, predicted, side="right") - 1
+        columns = (None, predicted**2, observed**2)
+        return CalibrationSums(
+            len(depth),
+            np.array([np.count_nonzero(error <= bound * sigma) for bound in _BOUNDS], np.int64),
+            math.fsum((error / sigma) ** 2),
+            _counted(error / sigma),
+            np.stack([np.bincount(place, column, len(SIGMA_EDGES) - 1) for column in columns], axis=1),
+        )
 
     @staticmethod
     def total(parts: Iterable[CalibrationSums]) -> CalibrationSums:
-        """The counts of several sets together."""
+        """The counts and sums of several sets together; at least one set."""
         listed = list(parts)
+        stacked = np.stack([p.by_sigma for p in listed], axis=-1)
         return CalibrationSums(
-            sum(p.n for p in listed), sum(p.within_1 for p in listed), sum(p.within_2 for p in listed)
+            sum(p.n for p in listed),
+            np.sum([p.within for p in listed], axis=0),
+            math.fsum(p.squares for p in listed),
+            np.sum([p.histogram for p in listed], axis=0),
+            np.array([[math.fsum(cell) for cell in row] for row in stacked]),
         )
 
-    def metrics(self) -> dict[str, float | int | None]:
-        """The shares; a Gaussian error has 0.683 and 0.954."""
-        share = [count / self.n if self.n else None for count in (self.within_1, self.within_2)]
-        return {"n": self.n, "within_1_sigma": share[0], "within_2_sigma": share[1]}
+    def metrics(self) -> dict[str, object]:
+        """How the errors compare with their sigmas; None where there is no pixel.
+
+        Returns:
+            `n`; `within_1_sigma` and `within_2_sigma`, which a Gaussian has as 0.683 and 0.954; `curve` of the observed
+            to the nominal share; `mean_square` of the errors in sigmas, and `robust_mean_square`, their squared median
+            over that of a Gaussian, both 1 where sigmas are honest; `by_sigma`, rms predicted and observed error in
+            shares of the estimated depth.
+        """
+        shares = [int(count) / self.n if self.n else None for count in self.within]
+        median = self._median()
+        return {
+            "n": self.n,
+            "within_1_sigma": shares[0],
+            "within_2_sigma": shares[1],
+            "curve": [{"nominal": p, "observed": share} for p, share in zip(NOMINAL, shares[2:], strict=True)],
+            "mean_square": self.squares / self.n if self.n else None,
+            "robust_mean_square": None if median is None else (median / _MEDIAN_OF_GAUSSIAN) ** 2,
+            "by_sigma": self._bins(),
+        }
+
+    def _bins(self) -> list[dict[str, float | int | None]]:
+        spans = pairwise(SIGMA_EDGES)
+        return [
+            {
+                "from": low,
+                "to": high if math.isfinite(high) else None,
+                "n": int(n),
+                "predicted": math.sqrt(predicted / n) if n else None,
+                "observed": math.sqrt(observed / n) if n else None,
+            }
+            for (low, high), (n, predicted, observed) in zip(spans, self.by_sigma.tolist(), strict=True)
+        ]
+
+    def _median(self) -> float | None:
+        """Median of the errors in sigmas, between the edges of its bin as the logarithm goes."""
+        if not self.n:
+            return None
+        reached = np.cumsum(self.histogram)
+        half = self.n / 2.0
+        k = int(np.searchsorted(reached, half))
+        inside = (half - float(reached[k] - self.histogram[k])) / float(self.histogram[k])
+        return float(2.0 ** ((k + inside) / _PER_OCTAVE - _OCTAVES))
+
+
+def _counted(normalised: Floats) -> Ints:
+    with np.errstate(divide="ignore"):
+        place = np.floor(_PER_OCTAVE * (np.log2(normalised) + _OCTAVES))
+    rows = np.clip(place, 0, _HISTOGRAM - 1).astype(np.int64)
+    return np.bincount(rows, minlength=_HISTOGRAM).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,5 +176,6 @@ class MapSums:
 
     def metrics(self) -> dict[str, float | int | None]:
         """Root mean squares, m."""
-        rms = [math.sqrt(total / self.n) if self.n else None for total in (self.vertical, self.horizontal)]
-        return {"n": self.n, "rmse_z_m": rms[0], "rmse_h_m": rms[1]}
+        sums = (self.vertical, self.horizontal, self.vertical + self.horizontal)
+        rms = [math.sqrt(total / self.n) if self.n else None for total in sums]
+        return {"n": self.n, "rmse_z_m": rms[0], "rmse_h_m": rms[1], "rmse_3d_m": rms[2]}

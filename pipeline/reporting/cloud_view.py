@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.flight import camera_by_frame, cameras_of, placements_of
-from pipeline.geometry.arrays import Bytes, Floats
+from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement
 from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of, points_of
+from pipeline.reporting.point_colours import HEIGHT, PHOTO, SIGMA, PointColours
 from pipeline.reporting.thinning import ShownPoints, thinned
 from pipeline.reporting.typed_arrays import singles
 
@@ -25,7 +26,6 @@ MOST_FRAMES = 400
 _CAMERAS = "#e0822b"
 # Height of the pyramid of a camera, as a share of what the scene spans.
 _PYRAMID_SHARE = 0.025
-_EXTREMES = (1.0, 99.0)
 
 
 def figures(run: RunData) -> list[Figure]:
@@ -44,25 +44,23 @@ def figures(run: RunData) -> list[Figure]:
     if points is None:
         return []
     ground, shown = ground_of(run), thinned(points, MOST_POINTS)
-    corner = ground.corner
-    offset = ", ".join(f"{value:,.0f}" for value in corner)
+    corner, colours = ground.corner, PointColours(shown, ground.axes[2], (PHOTO, HEIGHT, SIGMA))
     left_out = "" if len(shown) == points.rows else f", thinned evenly from {points.rows:,}"
-    traces = (_cloud(shown, corner), _cameras(run, ground, shown, corner))
+    traces = (_cloud(shown, corner, colours), _cameras(run, ground, shown, corner))
     return [
         Figure(
             "cloud",
             "Points and cameras",
             f"{len(shown):,} points{left_out}, and the cameras with their pyramids of sight. Drag to turn, scroll to "
-            f"come nearer; the menu chooses the colours. Coordinates are counted from {offset} m"
-            f"{'' if ground.transform is None else f' of {ground.transform.crs.name}'}.",
+            f"come nearer; the buttons choose the colours.{_counted(ground)}",
             traces,
-            _layout(shown, ground),
+            _layout(colours),
             620,
         )
     ]
 
 
-def _cloud(shown: ShownPoints, corner: Floats) -> dict[str, Any]:
+def _cloud(shown: ShownPoints, corner: Floats, colours: PointColours) -> dict[str, Any]:
     at = np.round(shown.xyz - corner, 2)
     return {
         "type": "scatter3d",
@@ -71,62 +69,8 @@ def _cloud(shown: ShownPoints, corner: Floats) -> dict[str, Any]:
         "x": singles(at[:, 0]),
         "y": singles(at[:, 1]),
         "z": singles(at[:, 2]),
-        "marker": {"size": 1.6, "color": hex_colours(shown.rgb), "line": {"width": 0}, "showscale": False},
-        "hovertemplate": "E %{x:.2f} m, N %{y:.2f} m, up %{z:.2f} m<extra></extra>",
-    }
-
-
-def hex_colours(rgb: Bytes) -> list[str]:
-    """Colours as #rrggbb.
-
-    Args:
-        rgb: (n, 3).
-    """
-    packed = rgb.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
-    return [f"#{value:06x}" for value in packed.tolist()]
-
-
-def colour_menu(shown: ShownPoints, height_title: str, corner_m: float, trace: int) -> dict[str, Any]:
-    """A menu that colours points by photo, height or sigma.
-
-    Args:
-        shown: The points.
-        height_title: Title of the heights.
-        corner_m: What heights are counted from.
-        trace: Index of the points' trace.
-
-    Returns:
-        An entry of plotly's `updatemenus`.
-    """
-    choices = [("photo colours", {"marker.color": [hex_colours(shown.rgb)], "marker.showscale": False})]
-    for name, title, values, scale in (
-        ("height", height_title, shown.xyz[:, 2] - corner_m, "Viridis"),
-        ("sigma", "sigma of the position (m)", shown.sigma_m, "Cividis"),
-    ):
-        low, high = np.percentile(values, _EXTREMES) if len(values) else (0.0, 1.0)
-        bar = {"title": {"text": title, "side": "right"}, "thickness": 14, "len": 0.7, "outlinewidth": 0}
-        choices.append(
-            (
-                name,
-                {
-                    "marker.color": [singles(values)],
-                    "marker.cmin": float(low),
-                    "marker.cmax": float(high),
-                    "marker.colorscale": scale,
-                    "marker.showscale": True,
-                    "marker.colorbar": [bar],
-                },
-            )
-        )
-    return {
-        "type": "buttons",
-        "direction": "right",
-        "x": 0.0,
-        "xanchor": "left",
-        "y": 1.0,
-        "yanchor": "bottom",
-        "pad": {"b": 4},
-        "buttons": [{"label": name, "method": "restyle", "args": [change, [trace]]} for name, change in choices],
+        "marker": {"size": 2, "line": {"width": 0}, **colours.marker()},
+        "hovertemplate": "east %{x:.2f} m, north %{y:.2f} m, height %{z:.2f} m<extra></extra>",
     }
 
 
@@ -162,17 +106,24 @@ def _pyramid(placed: Placement, camera: Camera, height_m: float) -> Floats:
     return np.array([o, a, b, o, c, b, c, d, o, d, a, gap])
 
 
-def _layout(shown: ShownPoints, ground: Ground) -> dict[str, Any]:
-    counted = "from the corner (m)"
+def _counted(ground: Ground) -> str:
+    """What the level coordinates are counted from, where that is not the origin."""
+    if ground.transform is None:
+        return ""
+    east, north, _ = ground.corner
+    return f" East and north are counted from {east:,.0f} and {north:,.0f} m of {ground.transform.crs.name}."
+
+
+def _layout(colours: PointColours) -> dict[str, Any]:
     return {
         "scene": {
             "aspectmode": "data",
-            "xaxis": {"title": {"text": f"E {counted}"}},
-            "yaxis": {"title": {"text": f"N {counted}"}},
-            "zaxis": {"title": {"text": "up (m)"}},
-            "camera": {"eye": {"x": -0.9, "y": -0.9, "z": 0.7}},
+            "xaxis": {"title": {"text": "east (m)"}},
+            "yaxis": {"title": {"text": "north (m)"}},
+            "zaxis": {"title": {"text": "height (m)"}},
+            "camera": {"eye": {"x": -0.9, "y": -1.7, "z": 1.1}, "center": {"x": 0.0, "y": 0.0, "z": -0.2}},
         },
-        "updatemenus": [colour_menu(shown, "up (m)", float(ground.corner[2]), 0)],
+        "updatemenus": [colours.menu(0)],
         "margin": {"l": 0, "r": 0, "t": 44, "b": 0},
-        "legend": {"orientation": "h"},
+        "legend": {"x": 0.0, "y": 0.0, "yanchor": "bottom"},
     }

@@ -13,8 +13,9 @@ from pipeline.reporting.error_sums import ErrorSums, error_sums
 from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of
-from pipeline.reporting.painting import SIGNED, scale_stops
 from pipeline.reporting.palette import QUIET, colours, label
+from pipeline.reporting.point_colours import bar, beside_title
+from pipeline.reporting.scales import RISING, SIGNED, stops
 from pipeline.reporting.typed_arrays import singles, typed
 
 # Bins of the histogram that is drawn, and how far it goes: wide enough for most of the published method's errors.
@@ -51,21 +52,23 @@ def _spread(sums: ErrorSums) -> Figure:
     traces = []
     for (name, colour), counts in zip(colours(sums.methods).items(), sums.histogram, strict=True):
         centres, shares, beyond = sums.rebinned(counts, limit, _DRAWN_BINS)
+        published = name == sums.methods[0]
         traces.append(
             {
                 "type": "scatter",
                 "mode": "lines",
+                "fill": "tozeroy" if published else "none",
                 "name": f"{label(name)} ({100.0 * beyond:.1f} % beyond)",
                 "x": singles(centres),
                 "y": singles(100.0 * shares),
-                "line": {"shape": "hvh", "color": colour, "width": 2},
+                "line": {"shape": "hvh", "color": colour, "width": 2.5 if published else 1.6},
                 "hovertemplate": "%{x:.2f} %: %{y:.2f} % of pixels<extra>" + label(name) + "</extra>",
             }
         )
     layout = {
         "xaxis": {"title": {"text": "signed error (% of the reference)"}, "range": [-limit, limit]},
         "yaxis": {"title": {"text": "share of kept pixels per bin (%)"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "y": -0.2},
+        "legend": {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"},
     }
     return Figure(
         "error-spread",
@@ -79,41 +82,56 @@ def _spread(sums: ErrorSums) -> Figure:
 
 
 def _over_image(sums: ErrorSums) -> Figure:
-    width, height = sums.image_px
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.where(sums.image_n >= _LEAST, 100.0 * sums.image_sum / sums.image_n, np.nan)
-    top = _cell_limit(means)
+    width, height = sums.image_px
     down, across = means.shape[1:]
-    traces = [
-        {
-            "type": "heatmap",
-            "name": label(name),
-            "z": singles(cells),
-            "x0": width / across / 2.0 - 0.5,
-            "dx": width / across,
-            "y0": height / down / 2.0 - 0.5,
-            "dy": height / down,
-            "zmin": 0.0,
-            "zmax": top,
-            "colorscale": "Cividis",
-            "colorbar": _bar("mean |error| (% of the reference)"),
-            "visible": m == 0,
-            "hoverongaps": False,
-            "hovertemplate": "u %{x:.0f} px, v %{y:.0f} px: %{z:.2f} %<extra>" + label(name) + "</extra>",
+    columns = min(len(sums.methods), 2 if len(sums.methods) in (2, 4) else 3)
+    rows = -(-len(sums.methods) // columns)
+    layout: dict[str, Any] = {
+        "coloraxis": {
+            "cmin": 0.0,
+            "cmax": _cell_limit(means),
+            "colorscale": stops(RISING),
+            "colorbar": bar("mean |error| (% of the reference)"),
+        },
+        "grid": {"rows": rows, "columns": columns, "pattern": "independent", "ygap": 0.4},
+        "annotations": [],
+        "margin": {"t": 30},
+    }
+    traces = []
+    for m, (name, cells) in enumerate(zip(sums.methods, means, strict=True)):
+        number = str(m + 1) if m else ""
+        traces.append(
+            {
+                "type": "heatmap",
+                "name": label(name),
+                "z": singles(cells),
+                "x0": width / across / 2.0 - 0.5,
+                "dx": width / across,
+                "y0": height / down / 2.0 - 0.5,
+                "dy": height / down,
+                "xaxis": f"x{number}",
+                "yaxis": f"y{number}",
+                "coloraxis": "coloraxis",
+                "hoverongaps": False,
+                "hovertemplate": "u %{x:.0f} px, v %{y:.0f} px: %{z:.2f} %<extra>" + label(name) + "</extra>",
+            }
+        )
+        axis = {"constrain": "domain", "zeroline": False, "showgrid": False, "nticks": 6}
+        layout[f"xaxis{number}"] = {
+            **axis,
+            "title": {"text": "column u (px)", "standoff": 4},
+            "range": [-0.5, width - 0.5],
         }
-        for m, (name, cells) in enumerate(zip(sums.methods, means, strict=True))
-    ]
-    layout = {
-        "xaxis": {"title": {"text": "column u (px)"}, "range": [-0.5, width - 0.5], "constrain": "domain"},
-        "yaxis": {
+        layout[f"yaxis{number}"] = {
+            **axis,
             "title": {"text": "row v (px)"},
             "range": [height - 0.5, -0.5],
-            "scaleanchor": "x",
-            "constrain": "domain",
-        },
-        "updatemenus": _menus(sums.methods, 0),
-        "margin": {"t": 48},
-    }
+            "scaleanchor": f"x{number}",
+        }
+        above = {"xref": f"x{number} domain", "yref": f"y{number} domain", "x": 0.5, "y": 1.0, "yanchor": "bottom"}
+        layout["annotations"].append({"text": label(name), "showarrow": False, **above})
     return Figure(
         "error-image",
         "Errors over the image",
@@ -122,7 +140,7 @@ def _over_image(sums: ErrorSums) -> Figure:
         "Empty cells have too few pixels.",
         tuple(traces),
         layout,
-        480,
+        80 + rows * round((900 / columns) * height / width),
     )
 
 
@@ -142,8 +160,8 @@ def _on_ground(run: RunData, sums: ErrorSums, ground: Ground) -> Figure:
             "dy": plan.edge,
             "zmin": -limit,
             "zmax": limit,
-            "colorscale": scale_stops(SIGNED),
-            "colorbar": _bar("mean error of the depth (m)"),
+            "colorscale": stops(SIGNED),
+            "colorbar": bar("mean error of the depth (m)"),
             "visible": m == 0,
             "hoverongaps": False,
             "hovertemplate": "%{x:,.1f}, %{y:,.1f}: %{z:.3f} m<extra>" + label(name) + "</extra>",
@@ -165,13 +183,12 @@ def _on_ground(run: RunData, sums: ErrorSums, ground: Ground) -> Figure:
         }
     )
     layout = {
-        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.0f", "zeroline": False, "constrain": "domain"},
+        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.0f", "zeroline": False},
         "yaxis": {
             "title": {"text": ground.axes[1]},
             "tickformat": ",.0f",
             "zeroline": False,
             "scaleanchor": "x",
-            "constrain": "domain",
         },
         "updatemenus": _menus(sums.methods, 1),
         "showlegend": False,
@@ -194,10 +211,6 @@ def _cell_limit(means: Floats) -> float:
     return float(np.percentile(found, _CELL_SHARE)) if len(found) and found.any() else 1.0
 
 
-def _bar(title: str) -> dict[str, Any]:
-    return {"title": {"text": title, "side": "right"}, "thickness": 14, "outlinewidth": 0}
-
-
 def _menus(methods: Sequence[str], others: int) -> list[dict[str, Any]]:
     """Buttons that show one method's cells, and always the last `others` traces."""
     if len(methods) < 2:
@@ -210,5 +223,4 @@ def _menus(methods: Sequence[str], others: int) -> list[dict[str, Any]]:
         }
         for shown, name in enumerate(methods)
     ]
-    place = {"x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": 4}}
-    return [{"type": "buttons", "direction": "right", "buttons": buttons, **place}]
+    return [beside_title(buttons)]

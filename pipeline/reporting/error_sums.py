@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from pipeline.engine.tables import dataset, explained
 from pipeline.flight import camera_by_frame, cameras_of, column, columns, placements_of
-from pipeline.geometry.arrays import AnyArray, Floats, Ints
+from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.poses import Placement
 from pipeline.reporting.gathered import RunData
@@ -102,7 +102,8 @@ class ErrorSums:
         inner = counts[_BINS // 2 - half : _BINS // 2 + half].reshape(-1, each).sum(axis=1)
         total = max(int(counts.sum()), 1)
         centres = (np.arange(len(inner)) + 0.5) * each * _BIN_PERCENT - half * _BIN_PERCENT
-        return centres, inner / total, 1.0 - float(inner.sum()) / total
+        shares: Floats = inner / total
+        return np.asarray(centres, np.float64), shares, 1.0 - float(shares.sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +206,12 @@ def _add(sums: ErrorSums, table: pa.Table, flight: _Flight) -> None:
     _count(sums.image_sum, sums.image_n, method, cell, np.abs(relative), in_image)
     place = (flight.places(frame, pixels, reference) - sums.plan.corner) / sums.plan.edge
     down, east = sums.plan.shape
-    inside = (np.isfinite(place) & (place >= 0.0) & (place < (east, down))).all(axis=1)
+    inside: Bools = np.all(np.isfinite(place) & (place >= 0.0) & (place < (east, down)), axis=1)
     cell = np.floor(np.where(inside[:, None], place, 0.0)).astype(np.int64)
     _count(sums.plan_sum, sums.plan_n, method, cell, depth - reference, inside)
 
 
-def _count(total: Floats, n: Ints, method: Ints, cell: Ints, values: Floats, which: AnyArray) -> None:
+def _count(total: Floats, n: Ints, method: Ints, cell: Ints, values: Floats, which: Bools) -> None:
     at = (method[which], cell[which, 1], cell[which, 0])
     np.add.at(total, at, values[which])
     np.add.at(n, at, 1)

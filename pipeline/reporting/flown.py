@@ -8,10 +8,10 @@ import numpy as np
 
 from pipeline.flight import column, columns, placements_of
 from pipeline.geometry.arrays import Bools, Floats
-from pipeline.reporting.cloud_view import colour_menu
 from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of, points_of
+from pipeline.reporting.point_colours import HEIGHT, PHOTO, SIGMA, PointColours
 from pipeline.reporting.thinning import ShownPoints, thinned
 from pipeline.reporting.typed_arrays import typed
 
@@ -41,8 +41,9 @@ def figures(run: RunData) -> list[Figure]:
     """
     ground, points = ground_of(run), points_of(run)
     shown = ShownPoints.none() if points is None else thinned(points, MOST_POINTS)
+    colours = PointColours(shown, ground.axes[2], (HEIGHT, SIGMA, PHOTO)) if len(shown) else None
     traces = [
-        *([_points(shown)] if len(shown) else []),
+        *([] if colours is None else [_points(shown, colours)]),
         *_pairs(run, ground),
         *_frames(run, ground, shown),
     ]
@@ -54,14 +55,13 @@ def figures(run: RunData) -> list[Figure]:
             f"Each frame with a line towards what it looks at, and lines between the frames of a pair.{of_points} a "
             "click in the legend shows or hides a kind.",
             tuple(traces),
-            _layout(ground, shown),
+            _layout(ground, colours),
             620,
         )
     ]
 
 
-def _points(shown: ShownPoints) -> dict[str, Any]:
-    low, high = np.percentile(shown.xyz[:, 2], (1.0, 99.0))
+def _points(shown: ShownPoints, colours: PointColours) -> dict[str, Any]:
     return {
         "type": "scatter",
         "mode": "markers",
@@ -69,14 +69,7 @@ def _points(shown: ShownPoints) -> dict[str, Any]:
         "x": typed(np.round(shown.xyz[:, 0], 2)),
         "y": typed(np.round(shown.xyz[:, 1], 2)),
         "customdata": typed(np.round(shown.xyz[:, 2:], 2)),
-        "marker": {
-            "size": 3,
-            "color": typed(np.round(shown.xyz[:, 2], 2)),
-            "cmin": float(low),
-            "cmax": float(high),
-            "colorscale": "Viridis",
-            "showscale": True,
-        },
+        "marker": {"size": 3, **colours.marker()},
         "hovertemplate": "%{x:.2f}, %{y:.2f}, height %{customdata[0]:.2f} m<extra></extra>",
     }
 
@@ -99,7 +92,7 @@ def _pairs(run: RunData, ground: Ground) -> list[dict[str, Any]]:
         return _strokes(*ground.place(both))
 
     return [
-        _line("rejected pairs", lines(drawn), _REJECTED, 0.3, 1.0),
+        _line("rejected pairs", lines(drawn), _REJECTED, 0.45, 1.0),
         _line("selected pairs", lines(placed & selected), _PAIRS, 0.8, 1.4),
     ]
 
@@ -144,15 +137,14 @@ def _frames(run: RunData, ground: Ground, shown: ShownPoints) -> list[dict[str, 
             "y": typed(np.round(at[:, 1], 2)),
             "text": list(placed),
             "customdata": typed(np.round(told, 3)),
-            "marker": {"size": 8, "color": _FRAMES, "line": {"width": 1, "color": "#ffffff"}},
+            "marker": {"size": 7, "color": _FRAMES, "line": {"width": 1, "color": "#ffffff"}},
             "hovertemplate": "<b>%{text}</b><br>height %{customdata[0]:.2f} m<br>"
             "one sigma: %{customdata[1]:.3f} m level, %{customdata[2]:.3f} m up<extra></extra>",
         },
     ]
 
 
-def _layout(ground: Ground, shown: ShownPoints) -> dict[str, Any]:
-    menus = [colour_menu(shown, ground.axes[2], 0.0, 0)] if len(shown) else []
+def _layout(ground: Ground, colours: PointColours | None) -> dict[str, Any]:
     return {
         "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.0f", "zeroline": False},
         "yaxis": {
@@ -162,7 +154,8 @@ def _layout(ground: Ground, shown: ShownPoints) -> dict[str, Any]:
             "scaleanchor": "x",
             "scaleratio": 1,
         },
-        "updatemenus": menus,
-        "legend": {"orientation": "h", "y": -0.14},
+        "updatemenus": [] if colours is None else [colours.menu(0)],
+        "legend": {"orientation": "h", "x": 1.0, "xanchor": "right", "y": 1.0, "yanchor": "bottom"},
         "hovermode": "closest",
+        "margin": {"t": 56},
     }

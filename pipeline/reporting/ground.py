@@ -13,7 +13,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.points.geoparquet import PointDataset
 from pipeline.reporting.gathered import RunData
 
-_LOCAL_AXES = ("east of the origin (m)", "north of the origin (m)", "above the origin (m)")
+_LOCAL_AXES = ("east of the origin (m)", "north of the origin (m)", "height above the origin (m)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class Ground:
 
     @property
     def corner(self) -> Floats:
-        """(3,) whole hundreds of metres near the local origin: what is left after it fits single precision."""
-        out: Floats = np.round(self.place(np.zeros(3)), -2)
-        return out
+        """(3,) m near the local origin, in hundreds and level: what is left after it fits single precision."""
+        east, north, _ = np.round(self.place(np.zeros(3)), -2)
+        return np.array([east, north, 0.0])
 
 
 def points_of(run: RunData) -> PointDataset | None:

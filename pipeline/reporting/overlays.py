@@ -21,17 +21,9 @@ from pipeline.geometry.arrays import Bytes, Floats
 from pipeline.matching.images import read_colour
 from pipeline.reporting.figure import Figure, OverlayRow
 from pipeline.reporting.gathered import RunData
-from pipeline.reporting.painting import (
-    DEPTH,
-    SIGNED,
-    backdrop,
-    coloured,
-    data_uri,
-    painted,
-    scale_stops,
-    small,
-)
+from pipeline.reporting.painting import backdrop, data_uri, painted, small
 from pipeline.reporting.palette import label
+from pipeline.reporting.scales import DEPTH, SIGNED, coloured, stops
 from pipeline.scoring.lines import frames_in
 
 SHOWN = 6
@@ -44,7 +36,6 @@ _MARGIN = {"l": 52, "r": 76, "t": 8, "b": 44}
 # What a colour bar spans: most of the values, not the few that are far off.
 _DEPTH_SHARES = (2.0, 98.0)
 _ERROR_SHARE = 90.0
-_NO_PHOTO = "; the photo is not where it was, so the ground is plain grey"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +80,11 @@ class _Sheet:
         frame_id: The frame.
         full: Width and height of its photo, px.
         ground: The picture that is painted on.
-        note: What the captions add.
     """
 
     frame_id: str
     full: tuple[int, int]
     ground: Bytes
-    note: str
 
 
 def rows(run: RunData) -> list[OverlayRow]:
@@ -120,7 +109,7 @@ def rows(run: RunData) -> list[OverlayRow]:
         camera = cameras[frame_id]
         photo = _photo(run, frame_id)
         full = (camera.width, camera.height)
-        sheet = _Sheet(frame_id, full, backdrop(photo, full), _NO_PHOTO if photo is None else "")
+        sheet = _Sheet(frame_id, full, backdrop(photo, full))
         panels = _panels(run, sheet, photo, depths.get(frame_id, {}), scored.get(frame_id, {}))
         found.append(OverlayRow(frame_id, why, panels))
     return found
@@ -237,13 +226,13 @@ def _error_limit(judged: Sequence[_Dots]) -> float:
 
 def _photo_panel(sheet: _Sheet, photo: Bytes | None) -> Figure:
     if photo is None:
-        return _panel(sheet, "photo", "Photo", "The photo is not where it was when the run was made.", sheet.ground)
+        return _panel(sheet, "photo", "Photo", "Not found where it was; the ground is plain grey.", sheet.ground)
     return _panel(sheet, "photo", "Photo", f"{sheet.frame_id} as taken.", photo)
 
 
 def _depth_panel(sheet: _Sheet, method: str, dots: _Dots, low: float, high: float) -> Figure:
     picture = painted(sheet.ground, sheet.full, dots.pixels, coloured(dots.depth_m, low, high, DEPTH))
-    caption = f"{len(dots.depth_m):,} depths, near is light; dark where the method has none{sheet.note}."
+    caption = f"{len(dots.depth_m):,} depths; dark where there is none."
     return _panel(sheet, method, label(method), caption, picture, _bar("depth (m)", low, high, DEPTH))
 
 
@@ -253,10 +242,7 @@ def _error_panel(sheet: _Sheet, method: str, dots: _Dots, limit: float) -> Figur
     order = known[np.argsort(np.abs(dots.error_percent[known]), kind="stable")]
     colours = coloured(dots.error_percent[order], -limit, limit, SIGNED)
     picture = painted(sheet.ground, sheet.full, dots.pixels[order], colours)
-    caption = (
-        f"{len(order):,} scored pixels: red is farther than the reference, blue nearer, and what is beyond "
-        f"{limit:g} % has the colour of the end{sheet.note}."
-    )
+    caption = f"{len(order):,} pixels with a reference; red too far, blue too near."
     bar = _bar("error (% of the reference)", -limit, limit, SIGNED)
     return _panel(sheet, f"{method}-error", f"Error of {label(method)}", caption, picture, bar)
 
@@ -274,7 +260,7 @@ def _bar(title: str, low: float, high: float, scale: Bytes) -> dict[str, Any]:
             "color": [low],
             "cmin": low,
             "cmax": high,
-            "colorscale": scale_stops(scale),
+            "colorscale": stops(scale),
             "showscale": True,
             "colorbar": {"title": {"text": title, "side": "right"}, "thickness": 12, "xpad": 6, "outlinewidth": 0},
         },

@@ -1,4 +1,4 @@
-"""Pictures of values at pixels: dots in the colours of a scale, on a darkened photo."""
+"""Pictures of values at pixels: coloured dots on a darkened photo."""
 
 from __future__ import annotations
 
@@ -12,67 +12,12 @@ from pipeline.matching.images import resized, shrunk_size
 
 WIDEST_PX = 640
 _QUALITY = 78
-_DARKEST_SHARE = 0.22
+_DARKEST_SHARE = 0.3
 # Where there is no photo: a grey on which dark and light dots both stand out.
 _PLAIN_GREY = 48
 # Share of the picture that dots cover if they do not touch, and the radii they are kept within.
-_COVER = 0.5
-_SMALLEST_PX, _LARGEST_PX = 1, 4
-
-
-def _ramp(stops: tuple[tuple[int, int, int], ...]) -> Bytes:
-    places = np.linspace(0.0, 255.0, len(stops))
-    channels = [np.interp(np.arange(256), places, [stop[c] for stop in stops]) for c in range(3)]
-    return np.stack(channels, axis=-1).round().astype(np.uint8)
-
-
-# Depth: near is light and far is dark on a scale whose lightness tells as much as its hue (viridis, turned round and
-# without its darkest part, which a darkened photo would swallow).
-DEPTH = _ramp(
-    (
-        (253, 231, 37),
-        (181, 222, 43),
-        (110, 206, 88),
-        (53, 183, 121),
-        (31, 158, 137),
-        (38, 130, 142),
-        (49, 104, 142),
-        (68, 79, 150),
-    )
-)
-# Signed errors: blue is too near, red too far, white none.
-SIGNED = _ramp(
-    ((49, 116, 206), (120, 170, 226), (190, 213, 240), (250, 250, 250), (248, 196, 176), (230, 124, 98), (200, 46, 46))
-)
-
-
-def scale_stops(scale: Bytes) -> list[list[object]]:
-    """A scale as plotly's `colorscale`.
-
-    Args:
-        scale: (256, 3) red, green, blue.
-
-    Returns:
-        Some 17 places from 0 to 1 with their colour.
-    """
-    places = np.linspace(0, 255, 18).round().astype(np.int64)
-    return [[float(place) / 255.0, "rgb({},{},{})".format(*scale[place])] for place in places]
-
-
-def coloured(values: Floats, low: float, high: float, scale: Bytes) -> Bytes:
-    """The colours of values; what lies outside the range takes the colour of its end.
-
-    Args:
-        values: (n,), finite.
-        low: Value of the scale's first colour.
-        high: Value of its last one.
-        scale: (256, 3).
-
-    Returns:
-        (n, 3) red, green, blue.
-    """
-    share = (values - low) / (high - low) if high > low else np.full(len(values), 0.5)
-    return scale[np.clip(np.round(share * 255.0), 0, 255).astype(np.int64)]
+_COVER = 0.4
+_SMALLEST_PX, _LARGEST_PX = 1, 3
 
 
 def backdrop(photo: Bytes | None, full: tuple[int, int]) -> Bytes:

@@ -103,7 +103,7 @@ def run(config: Config, context: Context) -> str:
         "curves": rows,
     }
     (folder / "sensitivity.json").write_text(to_json(told), encoding="utf-8")
-    return f"{sentence(ways.methods[0], limits, list(values))}; {counted(len(takes), 'take')}, beside {reference.kind}"
+    return f"{sentence(ways.methods[0], limits)}; {counted(len(takes), 'take')}, beside {reference.kind}"
 
 
 def _ways(config: Config, context: Context) -> Ways:

@@ -79,8 +79,8 @@ def withstood(rows: Sequence[Row], method: str, reference: str) -> dict[str, Any
         reference: What the depths are compared with.
 
     Returns:
-        `abs_rel` of no error, `threshold`, and by kind: `unit`, `injected` and `refined`, the smaller of both sides
-        (m or deg, linear between the errors tried); null where none tried is enough.
+        `abs_rel` of no error, `threshold`, and `by_kind`: `unit`, the `largest` error tried, and `injected` and
+        `refined`, each the smaller of both sides, linear between the errors tried; null where none of these is enough.
     """
     own = [row for row in rows if row["method"] == method and row["n"]]
     kinds = list(dict.fromkeys(row["kind"] for row in own))
@@ -93,6 +93,7 @@ def withstood(rows: Sequence[Row], method: str, reference: str) -> dict[str, Any
         "by_kind": {
             kind: {
                 "unit": UNITS[kind],
+                "largest": max(curves[kind, False]),
                 "injected": _reached(curves[kind, False], threshold),
                 "refined": _reached(curves[kind, True], threshold),
             }
@@ -124,17 +125,15 @@ def _reached(curve: Mapping[float, float], threshold: float) -> float | None:
     return min(found, default=None)
 
 
-def sentence(method: str, found: Mapping[str, Any], kinds: Sequence[str]) -> str:
+def sentence(method: str, found: Mapping[str, Any]) -> str:
     """What is withstood, in a line for people."""
     parts = [
-        f"{kind.replace('_', ' ')} {_told(found['by_kind'][kind], 'injected')}"
-        f" (refined {_told(found['by_kind'][kind], 'refined')})"
-        for kind in kinds
-        if kind in found["by_kind"]
+        f"{kind.replace('_', ' ')} {_told(entry, 'injected')} (refined {_told(entry, 'refined')})"
+        for kind, entry in found["by_kind"].items()
     ]
-    return f"AbsRel {method} {found['abs_rel']:.4f}; {found['threshold']:.4f} at " + ", ".join(parts)
+    return f"AbsRel {method} {found['abs_rel']:.4f} becomes {found['threshold']:.4f} by " + ", ".join(parts)
 
 
 def _told(entry: Mapping[str, Any], which: str) -> str:
     value = entry[which]
-    return "at none tried" if value is None else f"{value:.2g} {entry['unit']}"
+    return f"over {entry['largest']:g} {entry['unit']}" if value is None else f"{value:.2g} {entry['unit']}"

@@ -76,7 +76,7 @@ class PairErrors:
         relative: (c, 2, m, n) |depth - reference| / reference, without and with refinement; NaN at pixels that the
             method does not keep at no error.
         kept: (c, 2, m, n) whether the pixel is one of those and would be published.
-        epipole_inside: (c,) whether the error puts the epipole inside the ref image.
+        epipole_inside: (c,) whether the pose with the error has an epipole inside the ref or the src image.
     """
 
     relative: Singles
@@ -96,7 +96,8 @@ def pair_errors(
 
     A depth is compared whatever its predicted sigma says, at every pixel that the method keeps when no error is
     injected: a mask that hides what went wrong would flatten the curve. One that is behind a camera, or no number,
-    counts as `max_range_m`, and so does one beyond.
+    counts as `max_range_m`, and so does one beyond. Sigmas are those of the log, which does not know of the error; with
+    refinement, what that leaves of them. They weight the adaptive view, and say what would be published.
 
     Args:
         posed: The pair.
@@ -111,7 +112,7 @@ def pair_errors(
     inside = np.empty(len(cases), np.bool_)
     for c, case in enumerate(cases):
         log = posed.off_by(case)
-        inside[c] = epipole_inside(posed.ref, log.poses[posed.pair.src], posed.ref_camera)
+        inside[c] = epipole_inside(log, posed.pair)
         for r, refine in enumerate(REFINED):
             found = refine_pair(log, matched) if refine else as_logged(log, matched)
             for m, method in enumerate(ways.methods):
@@ -143,10 +144,18 @@ def relative_of(found: RefinedPair) -> RelativePose:
     return relative_placement(found.placed.ref, found.placed.src, jacobian @ found.covariance @ jacobian.T)
 
 
-def epipole_inside(ref: Pose, src: Pose, camera: Camera) -> bool:
-    """Whether the line through both centres meets the ref image plane inside the image."""
-    at, seen = (View(pose.rotation[None], pose.centre[None]) for pose in (ref, src))
-    ideal = (epipoles(at, seen, camera)[0] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+def epipole_inside(log: Log, pair: PairRow) -> bool:
+    """Whether the line through both centres meets the image of either: a turn of src moves the epipole in src alone."""
+    ref, src = (View(pose.rotation[None], pose.centre[None]) for pose in (log.poses[pair.ref], log.poses[pair.src]))
+    return any(
+        _holds(camera, epipoles(one, other, camera)[0])
+        for one, other, camera in ((ref, src, log.cameras[pair.ref]), (src, ref, log.cameras[pair.src]))
+    )
+
+
+def _holds(camera: Camera, ideal_px: Floats) -> bool:
+    """Whether an ideal pixel (2,), NaN at infinity, is seen in the image."""
+    ideal = (ideal_px - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return bool(camera.holds(camera.project(np.append(ideal, 1.0))))
 
 

@@ -21,7 +21,7 @@ CURVES = TableSchema(
         number("abs_rel", "1", "Mean of |depth - reference| / reference over them, masked or not.", nullable=True),
         number("median_rel", "1", "Median of the same.", nullable=True),
         number("kept_share", "1", "Share of them that would still be published.", nullable=True),
-        number("epipole_inside_share", "1", "Share of the pairs that have an epipole inside the ref or the src image with the error."),
+        number("epipole_inside_share", "1", "Share of the pairs with an epipole inside the ref or the src image."),
         flag("marked", "Whether any pair has."),
         count("n_pairs", "Pairs looked at."),
     ),

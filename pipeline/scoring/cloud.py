@@ -4,11 +4,12 @@ The measures are those of the ETH3D benchmark, accuracy and completeness by tole
 over small cubes so that places with many points count no more than others. LiDAR from the air asks for three changes:
 
 * Returns lie decimetres apart, so the distance to the nearest one says nothing below that. Points are held against the
-  plane of the nearest returns where these make one, and against the nearest return elsewhere.
+  plane of the nearest returns where these make one.
 * No scanner positions are at hand that would tell free space from unobserved space. A survey from above has seen
   everything down to its surface: a point above all returns around its column is in free space, and one below all of
-  them underground, wrong either way. Between the two (beside walls, below crowns), and where the survey has no returns,
-  a point away from all returns is left out and counted.
+  them underground, and either is as wrong as it is far from the nearest return. Between the two, where returns make no
+  surface (on walls, in crowns), and where there are no returns, points are left out and counted. A scan from among the
+  surfaces is dense: there the nearest return stands where no plane does, and what is far from both is left out.
 * A return is asked for where frames see it. Several do; it counts once.
 
 Source: Schoeps et al., "A multi-view stereo benchmark with high-resolution images and multi-camera videos" (CVPR 2017),
@@ -136,13 +137,12 @@ def _to_reference(
     if len(returns) < NEIGHBOURS or not np.isfinite(spacing):
         return np.full(len(points), np.nan), np.zeros(len(points), np.bool_)
     surface = surface_at(points, returns, cKDTree(returns), spacing)
-    close = _CLOSE_SPACINGS * spacing
-    observed: Bools = surface.nearest_m <= close
-    if from_above:
-        rest = np.flatnonzero(~observed)
-        observed[rest] = _beyond_column(points[rest], returns, close)
-    else:
-        observed |= surface.sound & (np.abs(surface.signed_m) <= furthest)
+    near = surface.nearest_m <= _CLOSE_SPACINGS * spacing
+    if not from_above:
+        return surface.distance_m, near | (surface.sound & (np.abs(surface.signed_m) <= furthest))
+    observed: Bools = near & surface.sound
+    rest = np.flatnonzero(~observed)
+    observed[rest] = _beyond_column(points[rest], returns, _CLOSE_SPACINGS * spacing)
     return surface.distance_m, observed
 
 

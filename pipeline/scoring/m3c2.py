@@ -213,5 +213,6 @@ def _members(
             offset = points[point] - core[cylinder]
             along = np.einsum("ni,ni->n", offset, normal[cylinder])
             across = np.sum(offset**2, axis=1) - along**2
-            inside = (across <= radius**2) & (along - middle >= -half) & (along - middle < half)
+            # A point where slabs meet lies in one of them.
+            inside = (across <= radius**2) & (np.floor((along + DEPTH_M) / (2.0 * half)) == slab)
             yield cylinder[inside], point[inside], along[inside]

@@ -29,7 +29,7 @@ _OPTIONAL = ("points", "scores", "sensitivity")
 class Config(StageConfig):
     """What the page is called."""
 
-    title: str | None = Field(None, description="Heading of the page; left out, the name of the first frames' folder")
+    title: str | None = Field(None, min_length=1, description="Heading of the page; left out, the flight's date")
 
 
 def run(config: Config, context: Context) -> str:
@@ -40,10 +40,9 @@ def run(config: Config, context: Context) -> str:
 
     places = {name: context.path(name) for name in _INPUTS}
     gathered = RunData({name: path for name, path in places.items() if path.exists()}, context.records())
-    title = config.title or "Depths and points of a flight"
-    found = numbers(gathered, title)
+    found = numbers(gathered, config.title)
     folder = context.output("report")
-    (folder / "index.html").write_text(page(title, found, sections(gathered, found)), encoding="utf-8")
+    (folder / "index.html").write_text(page(found, sections(gathered, found)), encoding="utf-8")
     (folder / "report.json").write_text(json_text(json.loads(json.dumps(found, default=str))), encoding="utf-8")
     grave = sum(doubt["rank"] == "grave" for doubt in found["distrust"])
     return f"report/index.html, {len(found['distrust'])} things to distrust, {grave} of them grave"

@@ -89,7 +89,7 @@ def _span(one: Mapping[str, Any]) -> str:
 
 def _frames(methods: Mapping[str, Any]) -> Figure | None:
     shades = colours(methods)
-    traces = []
+    traces: list[dict[str, Any]] = []
     for name, entry in methods.items():
         rows = [row for row in entry.get("per_frame") or [] if row["common"]["n"] >= LEAST_PIXELS]
         bounds = [((row.get("interval_95") or {}).get("common") or {}).get("abs_rel") for row in rows]
@@ -104,6 +104,7 @@ def _frames(methods: Mapping[str, Any]) -> Figure | None:
             "customdata": [row["common"]["n"] for row in rows],
             "hovertemplate": "%{x}: %{y:.4f} (%{customdata:,} pixels)",
             "marker": {"color": shades[name], "size": 8},
+            "zorder": -len(traces),
         }
         if all(bounds):
             trace["error_y"] = _bars([row["common"]["abs_rel"] for row in rows], bounds)

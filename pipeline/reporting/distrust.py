@@ -12,6 +12,7 @@ from typing import Any
 from pipeline.engine.progress import counted
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import label
+from pipeline.reporting.words import share as percent
 
 # Ranks.
 GRAVE, MIND, KNOW = 3, 2, 1
@@ -97,7 +98,9 @@ def _sigmas(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     one, two = shares[1], shares[2]
     if one is None or two is None:
         return
-    told = f"{one:.0%} of the errors lie within one sigma and {two:.1%} within two, where 68 % and 95 % should"
+    told = (
+        f"{percent(one)} of the errors lie within one sigma and {percent(two)} within two, where 68 % and 95 % should"
+    )
     if two < WITHIN[2] - WITHIN_TOLERANCE[2]:
         yield Doubt("sigmas", GRAVE, f"The sigmas are too small: {told}")
     elif one < WITHIN[1] - WITHIN_TOLERANCE[1]:
@@ -186,7 +189,7 @@ def _masked(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     if share > MASKED_SHARE:
         why, n = max(depths["masked_by_reason"].items(), key=lambda item: item[1])
         rank = MIND if share > 2 * MASKED_SHARE else KNOW
-        yield Doubt("masked", rank, f"{share:.0%} of the depths are masked, most ({n:,}) because: {why}")
+        yield Doubt("masked", rank, f"{percent(share)} of the depths are masked, most ({n:,}) because: {why}")
 
 
 def _bins(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
@@ -235,7 +238,7 @@ def _coverage(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     if numbers["how_good"] is None or not matches or met is None:
         return
     if (unseen := 1.0 - met / matches) > UNSEEN_SHARE:
-        text = f"{unseen:.0%} of the matches have no reference (out of range, hidden or off the LiDAR)"
+        text = f"{percent(unseen)} of the matches have no reference (out of range, hidden or off the LiDAR)"
         yield Doubt("coverage", KNOW, text)
 
 

@@ -21,12 +21,12 @@ from pipeline.reporting.quality import quality
 _DIGITS = 6
 
 
-def numbers(run: RunData, title: str) -> dict[str, Any]:
+def numbers(run: RunData, title: str | None = None) -> dict[str, Any]:
     """The object of `report.json`.
 
     Args:
         run: The run.
-        title: The report's.
+        title: The report's; None for the flight's date.
 
     Returns:
         `flown`, `came_out`, `how_good`, `distrust` (the minute), `metrics` and `sensitivity` as their stages wrote
@@ -45,7 +45,9 @@ def numbers(run: RunData, title: str) -> dict[str, Any]:
     counted["flown"] |= {
         name: {"p05": s.quantile(0.05), "median": s.quantile(0.5), "p95": s.quantile(0.95)} for name, s in seen.items()
     }
-    found: dict[str, Any] = {"schema": 1, "title": title, **rounded(counted), "how_good": quality(run)}
+    date = counted["flown"]["date"]
+    named = title or (f"Flight of {date}" if date else "Flight without a date")
+    found: dict[str, Any] = {"schema": 1, "title": named, **rounded(counted), "how_good": quality(run)}
     found["distrust"] = [doubt.as_object() for doubt in doubts(run, found)]
     return {**found, "metrics": run.metrics, "sensitivity": run.sensitivities, "stages": _stages(run.records)}
 

@@ -15,6 +15,7 @@ from pipeline.reporting import (
     accuracy_plots,
     calibration_plot,
     cloud_view,
+    error_plots,
     flown,
     overlays,
     pair_plots,
@@ -126,7 +127,7 @@ def _accuracy(run: RunData) -> Section:
         "Accuracy",
         "Estimated depths beside the reference, the methods beside one another. Arrows point to the better side.",
         tables=(*accuracy_tables(metrics, random), *(table for table in others if table)),
-        figures=tuple(accuracy_plots.figures(metrics, random)),
+        figures=(*accuracy_plots.figures(metrics, random), *error_plots.figures(run)),
     )
 
 
@@ -146,11 +147,10 @@ def _run(run: RunData) -> Section:
     )
 
 
-def page(title: str, numbers: dict[str, Any], parts: Sequence[Section]) -> str:
+def page(numbers: dict[str, Any], parts: Sequence[Section]) -> str:
     """The HTML of the report.
 
     Args:
-        title: The report's.
         numbers: The object of report.json.
         parts: The sections.
     """
@@ -163,7 +163,7 @@ def page(title: str, numbers: dict[str, Any], parts: Sequence[Section]) -> str:
     )
     environment.filters["figure_json"] = figure_json
     return environment.get_template("report.html.jinja").render(
-        title=title,
+        title=numbers["title"],
         headline=verdict.headline(numbers),
         minute=(
             ("What was flown", verdict.flown_lines(numbers)),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import in_order, label
+from pipeline.reporting.words import MISSING, interval, number, share, signed
 
-MISSING = "\N{EN DASH}"
 # The paper's rows in the paper's order: metric, words, whether less is better.
 METRICS = (
     ("abs_rel", "AbsRel", True),
@@ -33,6 +33,7 @@ class Table:
         rows: Cells, as long as the head.
         note: What to know of it; empty for nothing.
         strong: Which cells to make stand out: (row, column).
+        texts: Columns that hold words rather than numbers.
     """
 
     caption: str
@@ -40,26 +41,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     strong: frozenset[tuple[int, int]] = frozenset()
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number for people: significant digits without an exponent where that is short; a dash for none."""
-    if value is None:
-        return MISSING
-    if isinstance(value, int):
-        return f"{value:,}"
-    text = f"{value:#.{digits}g}".rstrip(".")
-    return f"{value:,.0f}" if abs(value) >= 10**digits else text
-
-
-def share(value: float | None) -> str:
-    """A share in percent."""
-    return MISSING if value is None else f"{100.0 * value:.1f} %"
-
-
-def interval(bounds: Sequence[float] | None) -> str:
-    """A 95 % interval in brackets; nothing for none."""
-    return "" if not bounds else f" [{number(bounds[0])}, {number(bounds[1])}]"
+    texts: frozenset[int] = frozenset()
 
 
 def accuracy_tables(metrics: Mapping[str, Any], untrained: frozenset[str]) -> tuple[Table, ...]:
@@ -90,12 +72,13 @@ def _paper_table(methods: Mapping[str, Any], which: str, caption: str, untrained
     strong: set[tuple[int, int]] = set()
     for key, words, less in METRICS:
         values = {name: entry[which][key] for name, entry in methods.items()}
+        told = {name: _told(value, key) for name, value in values.items()}
         bounds = {name: ((e.get("interval_95") or {}).get(which) or {}).get(key) for name, e in methods.items()}
         judged = {name: v for name, v in values.items() if v is not None and name not in untrained}
         if len(judged) > 1:
-            best = (min if less else max)(judged.values())
-            strong |= {(len(rows), 1 + i) for i, name in enumerate(methods) if judged.get(name) == best}
-        cells = (number(values[name]) + interval(bounds[name]) for name in methods)
+            best = told[(min if less else max)(judged, key=lambda name: judged[name])]
+            strong |= {(len(rows), 1 + i) for i, name in enumerate(methods) if name in judged and told[name] == best}
+        cells = (told[name] + interval(bounds[name]) for name in methods)
         rows.append((f"{words} {'↓' if less else '↑'}", *cells))
     rows.append(("Pixels", *(number(entry[which]["n"]) for entry in methods.values())))
     if which == "all":
@@ -108,16 +91,20 @@ def _paper_table(methods: Mapping[str, Any], which: str, caption: str, untrained
     return Table(caption, head, tuple(rows), note.strip(), frozenset(strong))
 
 
+def _told(value: float | None, key: str) -> str:
+    return f"{value:.4f}" if value is not None and key.startswith("delta") else number(value)
+
+
 def checkpoint_table(checkpoints: Mapping[str, Any] | None) -> Table | None:
     """Errors at the checkpoints, one row each and the root mean squares."""
     if not checkpoints or not checkpoints["n"]:
         return None
     rows = [
-        (one["name"], *(_signed(e) for e in one["error_m"]), *(number(s) for s in one["sigma_m"]), number(one["rays"]))
+        (one["name"], *(signed(e) for e in one["error_m"]), *(number(s) for s in one["sigma_m"]), number(one["rays"]))
         for one in checkpoints["points"]
     ]
     mean = checkpoints.get("mean_m") or (None, None, None)
-    rows.append(("Mean", *(_signed(e) for e in mean), "", "", "", ""))
+    rows.append(("Mean", *(signed(e) for e in mean), "", "", "", ""))
     head = ("Checkpoint", *(f"Error {axis} (m)" for axis in "ENU"), *(f"Sigma {axis} (m)" for axis in "ENU"), "Rays")
     return Table("Errors at the checkpoints", head, tuple(rows), str(checkpoints.get("statement") or ""))
 
@@ -139,7 +126,7 @@ def control_table(control: Mapping[str, Any] | None) -> Table | None:
         )
     )
     told = ", ".join(
-        f"{axis} {_signed(t)} ± {number(s)} m"
+        f"{axis} {signed(t)} ± {number(s)} m"
         for axis, t, s in zip(("east", "north", "up"), control["translation_m"], control["sigma_m"], strict=True)
     )
     head = ("Control point", "Observations", "RMS before (px)", "RMS after (px)")
@@ -156,10 +143,6 @@ def cloud_table(cloud: Mapping[str, Any] | None) -> Table | None:
     return Table("Points against the reference cloud", ("Tolerance", "Accuracy", "Completeness", "F1"), rows, note)
 
 
-def _signed(value: float | None) -> str:
-    return MISSING if value is None else f"{value:+.3f}"
-
-
 def frame_table(run: RunData) -> Table | None:
     """Frames that are not used, or used in spite of a problem; and those off the log."""
     told = [
@@ -172,7 +155,7 @@ def frame_table(run: RunData) -> Table | None:
         for row in run.poses.select(["frame_id", "problem"]).to_pylist()
         if row["problem"]
     ]
-    return Table("Frames with a problem", ("Frame", "Used", "Why"), tuple(told)) if told else None
+    return Table("Frames with a problem", ("Frame", "Used", "Why"), tuple(told), texts=frozenset({2})) if told else None
 
 
 def stage_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -181,7 +164,7 @@ def stage_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
         (stage, record.get("summary", ""), f"{record['seconds']:.1f}", number(record["peak_memory_mib"]))
         for stage, record in records.items()
     )
-    return Table("Stages", ("Stage", "Outcome", "Time (s)", "Peak memory (MiB)"), rows)
+    return Table("Stages", ("Stage", "Outcome", "Time (s)", "Peak memory (MiB)"), rows, texts=frozenset({1}))
 
 
 def configuration_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -193,7 +176,7 @@ def configuration_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
     )
     note = "What was set stands out from the defaults."
     strong = frozenset((i, 1) for i, row in enumerate(rows) if row[2] != "default")
-    return Table("Configuration", ("Key", "Value", "From"), rows, note, strong)
+    return Table("Configuration", ("Key", "Value", "From"), rows, note, strong, frozenset({1, 2}))
 
 
 def provenance_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -209,7 +192,9 @@ def provenance_table(records: Mapping[str, Mapping[str, Any]]) -> Table:
         for stage, record in records.items()
         for name, entry in record.get("outputs", {}).items()
     )
-    return Table("Provenance", ("Output", "Stage and version", "Rows", "Bytes", "SHA-256"), rows)
+    return Table(
+        "Provenance", ("Output", "Stage and version", "Rows", "Bytes", "SHA-256"), rows, texts=frozenset({1, 4})
+    )
 
 
 def _plain(value: Any) -> str:

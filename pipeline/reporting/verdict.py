@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.engine.progress import counted
 from pipeline.reporting.distrust import CHECKPOINTS, RANKS, WITHIN
 from pipeline.reporting.palette import label
-from pipeline.reporting.tables import MISSING, interval, number, share
+from pipeline.reporting.words import MISSING, interval, number, share
 
 Numbers = Mapping[str, Any]
 
@@ -196,7 +196,7 @@ def _from_to(values: Mapping[str, float | None]) -> str:
 
 
 def _area(area_m2: float) -> str:
-    return f"{number(area_m2 / 1e4)} ha" if area_m2 >= 1000.0 else f"{number(area_m2)} m²"
+    return f"{number(area_m2 / 1e4, 2)} ha" if area_m2 >= 1000.0 else f"{number(area_m2)} m²"
 
 
 def _duration(seconds: float) -> str:

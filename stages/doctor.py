@@ -19,6 +19,8 @@ from pipeline.engine.executors import usable_cores
 from pipeline.geodesy.heights import Geoid
 from pipeline.matching.weights.files import find_weights
 from pipeline.matching.weights.known import NETWORKS_OF
+from pipeline.monodepth.known import INSTALL
+from pipeline.monodepth.telling import states_of_baselines
 
 REQUIRED = (
     "numpy",
@@ -39,7 +41,10 @@ REQUIRED = (
     "av",
     "pycolmap",
 )
-OPTIONAL = {"distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'"}
+OPTIONAL = {
+    "distributed": "runs on a Dask cluster: pip install 'epitransfer[dask]'",
+    "transformers": f"learned baselines: {INSTALL}",
+}
 DATUMS = ("egm96", "egm2008")
 
 
@@ -53,6 +58,7 @@ def command(as_json: Annotated[bool, typer.Option("--json", help="One JSON objec
         "packages": {name: _version(name) for name in REQUIRED},
         "optional": {name: _version(name) or f"missing; {use}" for name, use in OPTIONAL.items()},
         "weights": {"/".join(group): _weights(group) for needs in NETWORKS_OF.values() for group in needs},
+        "baselines": states_of_baselines(),
         "torch_device": device_in_words(),
         "proj": {"version": pyproj.proj_version_str, "grids": {name: _grid(name) for name in DATUMS}},
         "leap_seconds_known_until": f"{TABLE_HOLDS_UNTIL:%Y-%m-%d}",

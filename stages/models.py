@@ -24,6 +24,12 @@ from pipeline.matching.weights.files import (
     weight_places,
 )
 from pipeline.matching.weights.known import KNOWN, NETWORKS_OF, KnownWeights, matchers_of
+from pipeline.matching.weights.telling import described, file_lines
+from pipeline.monodepth.found import CONFIGURED as MODELS_CONFIGURED
+from pipeline.monodepth.found import HUB
+from pipeline.monodepth.known import BASELINES, known_model
+from pipeline.monodepth.published import fetch_model
+from pipeline.monodepth.telling import described_models, judged, model_folders, model_lines
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
 
@@ -39,45 +45,20 @@ def show(as_json: AsJson = False) -> None:
             paths.setdefault(found.known.file, found.path)
     places = weight_places()
     if as_json:
-        files = [_described(known, paths.get(known.file)) for known in KNOWN]
+        files = [described(known, paths.get(known.file)) for known in KNOWN]
         looked = [{"folder": str(place.path), "origin": place.origin} for place in places]
-        typer.echo(json.dumps({"looked_in": looked, "files": files}))
+        typer.echo(json.dumps({"looked_in": looked, "files": files, "models": described_models()}))
         return
     for network in dict.fromkeys(known.network for known in KNOWN):
         typer.echo(f"{network}  (matchers: {', '.join(matchers_of(network))})")
         for known in (known for known in KNOWN if known.network == network):
-            _tell(known, paths.get(known.file))
+            typer.echo("\n".join(file_lines(known, paths.get(known.file))))
+    typer.echo("\n".join(model_lines()))
     typer.echo("looked in")
     for place in places:
         typer.echo(f"  {place}")
-    typer.echo(f"and in what ${VARIABLE} and {CONFIGURED} name")
-
-
-def _described(known: KnownWeights, path: Path | None) -> dict[str, object]:
-    return {
-        "network": known.network,
-        "file": known.file,
-        "matchers": matchers_of(known.network),
-        "found": str(path) if path else None,
-        "bytes": known.size_bytes,
-        "licence": known.licence,
-        "source": known.source,
-        "url": known.url,
-        "member": known.member,
-        "sha256": known.sha256,
-        "note": known.note,
-    }
-
-
-def _tell(known: KnownWeights, path: Path | None) -> None:
-    size = f"{known.size_bytes / 1e6:.1f} MB" if known.size_bytes else ""
-    typer.echo(f"  {known.file:<42}{size:<9}{known.licence:<14}{path or 'missing'}")
-    typer.echo(f"    from    {known.source}{f'; {known.note}' if known.note else ''}")
-    member = f", {known.member} in it" if known.member else ""
-    typer.echo(
-        f"    address {known.url}{member}" if known.url else "    address none: put the file into a folder by hand"
-    )
-    typer.echo(f"    sha256  {known.sha256}")
+    typer.echo(f"and in what ${VARIABLE} and {CONFIGURED} name; for baselines in what {MODELS_CONFIGURED} names and")
+    typer.echo(f"in the {HUB}")
 
 
 @app.command()
@@ -85,10 +66,11 @@ def fetch(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="MATCHER|NETWORK|FILE", help="All a matcher needs, a network's preferred file, or a file."
+            metavar="MATCHER|NETWORK|FILE|BASELINE|MODEL",
+            help="All a matcher needs, a network's or baseline's preferred file or model, or a file or model.",
         ),
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Every file that has an address.")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="Every file of the matchers that has an address.")] = False,
     to: Annotated[
         Path | None, typer.Option(metavar="FOLDER", file_okay=False, help="Where to; the user's cache by default.")
     ] = None,
@@ -98,13 +80,20 @@ def fetch(
 
     if bool(names) == everything:
         raise UsageError("E-WEIGHTS-10", "name networks or files, or --all", expected=_choices())
-    networks = [network for name in names or () for network in _networks_of(name)]
+    models = [model for name in names or () if (model := known_model(name))]
+    networks = [network for name in names or () if not known_model(name) for network in _networks_of(name)]
     wanted = [known for known in KNOWN if known.url] if everything else [_wanted(name) for name in networks]
     folder = to or cache_folder()
     for fetched in fetch_files(wanted, folder, Reporter(sys.stderr)):
         typer.echo(f"{fetched.path}: {'fetched, ' if fetched.fresh else 'already there, '}sha256 verified")
+    for model in models:
+        for file in fetch_model(model, folder, Reporter(sys.stderr)):
+            told = "sha256 verified, as stated by the publisher" if file.stated else "sha256 recorded"
+            typer.echo(f"{file.path}: {'fetched, ' if file.fresh else 'already there, '}{told}")
     if folder.resolve() not in {place.path.resolve() for place in weight_places()}:
-        sys.stderr.write(f"not a place that is looked in by itself: state --set {CONFIGURED}={folder}\n")
+        keys = [key for key, fetched in ((CONFIGURED, wanted), (MODELS_CONFIGURED, models)) if fetched]
+        stated = " ".join(f"--set {key}={folder}" for key in keys)
+        sys.stderr.write(f"not a place that is looked in by itself: state {stated}\n")
 
 
 def _networks_of(name: str) -> list[str]:
@@ -130,7 +119,7 @@ def _wanted(name: str) -> KnownWeights:
 
 def _choices() -> str:
     networks = dict.fromkeys(known.network for known in KNOWN)
-    return f"{', '.join(networks)}, or a file of theirs (epitransfer models list)"
+    return f"{', '.join((*networks, *BASELINES))}, or a file or model of theirs (epitransfer models list)"
 
 
 @app.command()
@@ -143,15 +132,22 @@ def verify(
     """Compares weights with their digests; exit code 3 if one differs."""
     found = _named(files) if files else all_weights()
     errors = [_error(entry) for entry in found]
+    folders = [
+        folder for path in files or (None,) for folder in model_folders(Path(path).expanduser() if path else None)
+    ]
+    models = judged(folders)
     if as_json:
         rows = [_judged(entry, error) for entry, error in zip(found, errors, strict=True)]
-        typer.echo(json.dumps({"files": rows}))
+        told = [{"path": str(model.folder), "verdict": model.verdict} for model in models]
+        typer.echo(json.dumps({"files": rows, "models": told}))
     else:
         for entry, error in zip(found, errors, strict=True):
             typer.echo(f"{'differs' if error else 'ok':<9}{entry.path}")
-        if not found:
+        for model in models:
+            typer.echo(f"{model.verdict:<9}{model.folder}")
+        if not found and not models:
             typer.echo(f"nothing to verify: no known weights in {', '.join(map(str, weight_places()))}")
-    _raise_first(errors)
+    _raise_first([*errors, *(model.error for model in models)])
 
 
 def _named(files: Sequence[str]) -> list[FoundWeights]:

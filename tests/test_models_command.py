@@ -7,12 +7,15 @@ import io
 import json
 import subprocess
 import sys
+import threading
 import zipfile
 from collections.abc import Iterator
-from contextlib import nullcontext
-from dataclasses import replace
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import huggingface_hub
 import pytest
 from test_cli import compared, spoken
 from weight_server import Served, serving
@@ -23,6 +26,10 @@ from pipeline.matching.weights import fetching
 from pipeline.matching.weights import files as weights
 from pipeline.matching.weights.fetching import fetch
 from pipeline.matching.weights.known import KnownWeights
+from pipeline.monodepth import known as baselines
+from pipeline.monodepth import telling
+from pipeline.monodepth.known import KnownModel
+from pipeline.monodepth.published import RECORD, fetch_model
 from stages import models
 
 CONTENT = bytes(range(256)) * 2048  # 512 KiB: several blocks, so that a cut one leaves something
@@ -50,6 +57,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setattr(weights, "cache_folder", lambda: folder)
     monkeypatch.setattr(models, "cache_folder", lambda: folder)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.delenv(weights.VARIABLE, raising=False)
     for name, value in (("NO_PROXY", "127.0.0.1"), ("COLUMNS", "100"), ("NO_COLOR", "1"), ("TERM", "dumb")):
         monkeypatch.setenv(name, value)
@@ -305,6 +313,8 @@ def test_list(server: Served, tmp_path: Path, cache: Path, capsys: pytest.Captur
     assert [entry["found"] for entry in found["files"]] == [None, None, None, str(cache / "raft-large.pth")]
     assert found["files"][0]["matchers"] == ["xfeat", "xfeat-star", "xfeat-lighterglue"]
     assert found["files"][2]["member"] == "models/small.pth"
+    assert [entry["name"] for entry in found["models"]] == [known.name for known in baselines.KNOWN_MODELS]
+    assert {entry["found"] for entry in found["models"]} == {None}
 
 
 @pytest.mark.usefixtures("known")
@@ -403,3 +413,209 @@ def test_doctor_tells_weights_and_device(cache: Path, capsys: pytest.CaptureFixt
         "raft-small/raft-large": str(cache / "raft-things.pth"),
     }
     assert told["torch_device"]
+    (cache / "zoedepth-kitti").mkdir()
+    (cache / "zoedepth-kitti" / "config.json").write_text("{}")
+    assert json.loads(spoken(capsys, "doctor", "--json")[1])["baselines"] == {
+        "zoedepth": str(cache / "zoedepth-kitti"),
+        "depth-anything-v2": "missing: epitransfer models fetch depth-anything-v2",
+    }
+
+
+# --- the baselines' models ---
+
+COMMIT = "c0ffee" * 6 + "c0ff"
+MODEL = {"model.safetensors": CONTENT, "preprocessor_config.json": b'{"do_pad": true}', "config.json": b"{}"}
+
+
+@dataclass
+class Hub:
+    """A publisher that sends on to where the files lie, and states the digest of the large one as it does."""
+
+    served: Served
+    stated: dict[str, str] = field(default_factory=dict)
+    status: int = 302
+    asked: list[str] = field(default_factory=list)
+    url: str = ""
+
+
+@contextmanager
+def publishing(hub: Hub) -> Iterator[Hub]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_HEAD(self) -> None:
+            self.do_GET()
+
+        def do_GET(self) -> None:
+            hub.asked.append(f"{self.command} {self.path}")
+            if hub.status != 302:
+                self.send_error(hub.status)
+                return
+            self.send_response(302)
+            name = self.path.rpartition("/")[2]
+            if name == "model.safetensors":
+                for header, value in hub.stated.items():
+                    self.send_header(header, value)
+            self.send_header("Location", f"{hub.served.url}/{name}")
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            """Says nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    hub.url = f"http://127.0.0.1:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
+    thread.start()
+    try:
+        yield hub
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    with serving({f"/{name}": data for name, data in MODEL.items()}) as served:
+        headers = {
+            "X-Linked-Etag": f'"{sha256(CONTENT)}"',
+            "X-Linked-Size": str(len(CONTENT)),
+            "X-Repo-Commit": COMMIT,
+        }
+        with publishing(Hub(served, headers)) as publisher:
+            yield publisher
+
+
+@pytest.fixture
+def zoe(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> KnownModel:
+    """The only known model, at a local publisher."""
+    model = KnownModel("zoedepth", "us/zoe-tiny", 1, "MIT", "indoor", "tiny", hub.url)
+    for module in (baselines, telling):
+        monkeypatch.setattr(module, "KNOWN_MODELS", (model,))
+    return model
+
+
+def got(model: KnownModel, into: Path) -> list[tuple[str, bool, bool]]:
+    return [(file.path.name, file.fresh, file.stated) for file in fetch_model(model, into, Reporter(io.StringIO()))]
+
+
+def not_got(kind: type[EpiTransferError], model: KnownModel, into: Path) -> EpiTransferError:
+    with pytest.raises(kind) as caught:
+        got(model, into)
+    return caught.value
+
+
+def test_a_model_is_fetched_once(zoe: KnownModel, hub: Hub, cache: Path) -> None:
+    order = ["model.safetensors", "preprocessor_config.json", "config.json"]
+    assert got(zoe, cache) == [(name, True, name == order[0]) for name in order]
+    assert {path.name: path.read_bytes() for path in (cache / "zoe-tiny").iterdir() if path.name != RECORD} == MODEL
+    assert json.loads((cache / "zoe-tiny" / RECORD).read_text()) == {
+        "repository": "us/zoe-tiny",
+        "revision": COMMIT,
+        "stated": ["model.safetensors"],
+        "sha256": {name: sha256(data) for name, data in MODEL.items()},
+    }
+    of_commit = [f"GET /us/zoe-tiny/resolve/{COMMIT}/{name}" for name in order]
+    assert hub.asked == ["HEAD /us/zoe-tiny/resolve/main/model.safetensors", *of_commit]
+    assert got(zoe, cache) == [(name, False, name == order[0]) for name in order]
+    assert len(hub.asked) == 4
+
+
+def test_a_models_weights_are_resumed(zoe: KnownModel, hub: Hub, cache: Path) -> None:
+    hub.served.cut_after = 300_000
+    assert not_got(ResourceError, zoe, cache).code == "E-WEIGHTS-08"
+    have = (cache / "zoe-tiny" / "model.safetensors.part").stat().st_size
+    assert 0 < have <= 300_000
+    assert names(cache / "zoe-tiny") == ["model.safetensors.part"]
+    assert len(got(zoe, cache)) == 3
+    assert ("/model.safetensors", f"bytes={have}-") in hub.served.asked
+    assert (cache / "zoe-tiny" / "model.safetensors").read_bytes() == CONTENT
+
+
+def test_weights_that_are_not_those_stated_are_not_kept(zoe: KnownModel, hub: Hub, cache: Path) -> None:
+    hub.served.files["/model.safetensors"] = CONTENT[:-1] + b"?"
+    error = not_got(InputError, zoe, cache)
+    assert (error.code, error.expected) == ("E-WEIGHTS-02", f"sha256 {sha256(CONTENT)}")
+    assert names(cache / "zoe-tiny") == []
+
+
+def test_a_publisher_that_states_nothing(zoe: KnownModel, hub: Hub, cache: Path) -> None:
+    hub.stated["X-Linked-Etag"] = '"33bc8aab40703678c3ebe94d2dd8f2afff285dd9"'  # a git blob's
+    error = not_got(InputError, zoe, cache)
+    assert (error.code, error.exit_code) == ("E-WEIGHTS-11", 3)
+    assert not cache.exists()
+    hub.status = 401
+    error = not_got(InputError, zoe, cache)
+    assert (error.code, error.found) == ("E-WEIGHTS-07", "HTTP 401 Unauthorized")
+    assert f"put model.safetensors into {cache / 'zoe-tiny'} by hand" in error.hint
+
+
+def test_settings_that_never_end_are_left(
+    zoe: KnownModel, hub: Hub, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fetching, "_SMALL_BYTES", 15)
+    assert not_got(InputError, zoe, cache).found == "a longer file"
+    assert names(cache / "zoe-tiny") == ["model.safetensors"]
+
+
+def test_nobody_publishes(zoe: KnownModel, cache: Path) -> None:
+    with serving({}) as gone:
+        url = gone.url
+    assert not_got(ResourceError, replace(zoe, publisher=url), cache).code == "E-WEIGHTS-08"
+    assert not_got(InputError, replace(zoe, publisher="http://192.0.2.1"), cache).expected == "https"
+
+
+@pytest.mark.usefixtures("known", "zoe")
+def test_commands_know_models(tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = cache / "zoe-tiny"
+    code, out, err = spoken(capsys, "models", "fetch", "zoedepth")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        f"{folder}/model.safetensors: fetched, sha256 verified, as stated by the publisher",
+        f"{folder}/preprocessor_config.json: fetched, sha256 recorded",
+        f"{folder}/config.json: fetched, sha256 recorded",
+    ]
+    assert spoken(capsys, "models", "fetch", "us/zoe-tiny")[1].count("already there") == 3
+    assert f"zoedepth  (baseline of score: takes {folder}; " in spoken(capsys, "models", "list")[1]
+    assert json.loads(spoken(capsys, "models", "list", "--json")[1])["models"][0]["found"] == str(folder)
+    code, out, err = spoken(capsys, "models", "fetch", "zoe-tiny", "xfeat", "--to", tmp_path / "there")
+    assert code == 0
+    assert err.endswith(f"state --set match.weights={tmp_path}/there --set score.models={tmp_path}/there\n")
+
+
+@pytest.mark.usefixtures("zoe")
+def test_models_are_verified(tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = cache / "zoe-tiny"
+    assert spoken(capsys, "models", "fetch", "zoedepth")[0] == 0
+    assert spoken(capsys, "models", "verify") == (0, f"ok       {folder}\n", "")
+    (folder / "config.json").write_text("{ }")
+    for named in ((), (folder,), (cache,)):
+        code, out, err = spoken(capsys, "models", "verify", *named)
+        assert (code, out) == (3, f"differs  {folder}\n")
+        assert "E-BASELINE-08" in err
+        assert "epitransfer models fetch zoe-tiny" in err
+    assert json.loads(spoken(capsys, "models", "verify", "--json")[1])["models"] == [
+        {"path": str(folder), "verdict": "differs"}
+    ]
+    (folder / "model.safetensors").unlink()
+    assert "no file" in spoken(capsys, "models", "verify")[2]
+    (folder / RECORD).unlink()
+    assert spoken(capsys, "models", "verify") == (0, f"unstated {folder}\n", "")
+    # A fetch puts right what differs, and keeps what was there.
+    assert spoken(capsys, "models", "fetch", "zoedepth")[1].count("fetched") == 3
+    assert spoken(capsys, "models", "verify", folder)[:2] == (0, f"ok       {folder}\n")
+
+
+def test_the_hub_caches_names_are_digests(zoe: KnownModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    repository = tmp_path / "hub" / "models--us--zoe-tiny"
+    snapshot = repository / "snapshots" / COMMIT
+    for folder in (snapshot, repository / "blobs", repository / "refs"):
+        folder.mkdir(parents=True)
+    (repository / "refs" / "main").write_text(COMMIT)
+    (snapshot / "config.json").write_text("{}")
+    blob = repository / "blobs" / sha256(CONTENT)
+    blob.write_bytes(CONTENT)
+    (snapshot / "model.safetensors").symlink_to(blob)
+    assert spoken(capsys, "models", "verify") == (0, f"ok       {snapshot}\n", "")
+    blob.write_bytes(CONTENT[:-1])
+    code, out, err = spoken(capsys, "models", "verify")
+    assert (code, out) == (3, f"differs  {snapshot}\n")
+    assert "as stated by the publisher" in err

@@ -13,7 +13,7 @@ from pipeline.engine.digests import digest_file
 from pipeline.engine.errors import InputError, MissingPartError, UsageError
 from pipeline.matching.weights.files import WeightPlace, weight_places
 from pipeline.monodepth.known import ARCHITECTURES, BASELINES, CONFIG, INSTALL, PROCESSOR, WEIGHTS, models_of
-from pipeline.monodepth.published import check_stated
+from pipeline.monodepth.published import check_recorded
 
 CONFIGURED = "score.models"
 HUB = "Hugging Face cache"
@@ -123,11 +123,11 @@ def candidates(baseline: str, stated: Path | None = None) -> Iterator[tuple[Path
             if (place.path / name / CONFIG).is_file():
                 yield place.path / name, place.origin
     for known in models_of(baseline):
-        if (folder := _in_hub_cache(known.repository)) is not None:
+        if (folder := in_hub_cache(known.repository)) is not None:
             yield folder, HUB
 
 
-def _in_hub_cache(repository: str) -> Path | None:
+def in_hub_cache(repository: str) -> Path | None:
     """The snapshot of a repository that transformers or huggingface_hub fetched earlier."""
     if importlib.util.find_spec("huggingface_hub") is None:
         return None
@@ -164,7 +164,7 @@ def read_model(folder: Path, baseline: str, origin: str) -> FoundModel:
         )
     _read_json(folder / PROCESSOR)
     sha256 = _checked_weights(folder)
-    check_stated(folder, sha256)
+    check_recorded(folder, sha256)
     name = config.get("_name_or_path") or folder.name
     untrained = config.get(UNTRAINED) is True
     return FoundModel(baseline, folder, origin, ARCHITECTURES[baseline], str(name), sha256, untrained)

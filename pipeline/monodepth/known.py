@@ -47,9 +47,9 @@ class KnownModel:
         """The address of its card."""
         return f"{self.publisher}/{self.repository}"
 
-    def url(self, file: str) -> str:
+    def url(self, file: str, revision: str = "main") -> str:
         """The address of one of its files."""
-        return f"{self.page}/resolve/main/{file}"
+        return f"{self.page}/resolve/{revision}/{file}"
 
 
 def _zoedepth(domain: str, scenes: str) -> KnownModel:
@@ -83,3 +83,9 @@ KNOWN_MODELS: tuple[KnownModel, ...] = (
 def models_of(baseline: str) -> tuple[KnownModel, ...]:
     """The known models that serve a baseline, the preferred first."""
     return tuple(known for known in KNOWN_MODELS if known.baseline == baseline)
+
+
+def known_model(name: str) -> KnownModel | None:
+    """The preferred model of a baseline, or the one of that name or repository."""
+    named = (known for known in KNOWN_MODELS if name in {known.baseline, known.name, known.repository})
+    return next(named, None)

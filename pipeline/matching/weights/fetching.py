@@ -24,6 +24,8 @@ _BLOCK = 1 << 16
 _CONNECT_S, _READ_S = 15.0, 60.0
 # Far above any known file: a server that never ends must not fill the disk.
 _MOST_BYTES = 1 << 29
+# Far above any file of settings.
+_SMALL_BYTES = 1 << 20
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
@@ -40,6 +42,21 @@ class Fetched:
     known: KnownWeights
     path: Path
     fresh: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """What a publisher states of a file.
+
+    Args:
+        sha256: Its digest.
+        size_bytes: Its size, where it is stated.
+        revision: The commit that the address stands for; "" where it is not stated.
+    """
+
+    sha256: str
+    size_bytes: int | None
+    revision: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +97,63 @@ def fetch(wanted: Sequence[KnownWeights], folder: Path, reporter: Reporter) -> I
             missing.setdefault(known.url, []).append(known)
     for url, files in missing.items():
         yield from _fetch_address(url, files, folder, reporter)
+
+
+def stated_of(url: str, path: Path) -> Stated:
+    """What the Hugging Face hub states of a file it holds in its large file storage, in the headers of its address.
+
+    Args:
+        url: The address.
+        path: Where the file is to be.
+
+    Raises:
+        InputError: There is no such file, or its digest is not stated.
+        ResourceError: The address cannot be reached.
+
+    Source: huggingface_hub, constants (X-Linked-Etag, X-Linked-Size, X-Repo-Commit).
+    """
+    download = _Download(url, path.with_name(f"{path.name}.part"), "", _MOST_BYTES, path.name)
+    hooks = {"response": _refuse_insecure_redirect}
+    headers = {"Accept-Encoding": "identity"}
+    with _network(download):
+        last = requests.head(url, headers=headers, hooks=hooks, allow_redirects=True, timeout=(_CONNECT_S, _READ_S))
+    # The hub sends on to where the file lies, and states the digest as it does.
+    answers = (*last.history, last)
+    for answer in answers:
+        digest = re.fullmatch('(?:W/)?"?([0-9a-f]{64})"?', answer.headers.get("X-Linked-Etag", ""))
+        if digest:
+            size = answer.headers.get("X-Linked-Size", "")
+            return Stated(digest[1], int(size) if size.isdecimal() else None, answer.headers.get("X-Repo-Commit", ""))
+    if not answers[0].ok:
+        raise _not_given(download, answers[0])
+    raise InputError(
+        "E-WEIGHTS-11",
+        "the publisher states no digest of the file, which is not fetched without",
+        where=url,
+        expected="a header X-Linked-Etag with a SHA-256",
+        hint=_by_hand(download),
+    )
+
+
+def fetch_small(url: str, path: Path) -> bytes:
+    """The content of a small file, which is not written.
+
+    Args:
+        url: The address.
+        path: Where it is to be.
+
+    Raises:
+        InputError: There is no such file, or it is too long for one of settings.
+        ResourceError: The address cannot be reached.
+    """
+    download = _Download(url, path.with_name(f"{path.name}.part"), "", _SMALL_BYTES, path.name)
+    data = b""
+    with _network(download), _answer(download, 0) as answer:
+        for block in answer.iter_content(_BLOCK):
+            data += block
+            if len(data) > _SMALL_BYTES:
+                raise _differs(download, "a longer file", f"at most {_SMALL_BYTES} bytes")
+    return data
 
 
 def _fetch_address(url: str, files: list[KnownWeights], folder: Path, reporter: Reporter) -> Iterator[Fetched]:
@@ -154,7 +228,11 @@ def _answer(download: _Download, have: int) -> Iterator[requests.Response]:
         with _answer(download, 0) as again:
             yield again
         return
-    raise InputError(
+    raise _not_given(download, answer)
+
+
+def _not_given(download: _Download, answer: requests.Response) -> InputError:
+    return InputError(
         "E-WEIGHTS-07",
         "the address does not give the file",
         where=download.url,

@@ -185,7 +185,7 @@ def _masked(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     depths = came["depths"].get(came["published_method"])
     if not depths or not depths["n"]:
         return
-    share = 1.0 - depths["kept"] / depths["n"]
+    share = (depths["n"] - depths["kept"]) / depths["n"]
     if share > MASKED_SHARE:
         why, n = max(depths["masked_by_reason"].items(), key=lambda item: item[1])
         rank = MIND if share > 2 * MASKED_SHARE else KNOW

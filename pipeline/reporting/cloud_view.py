@@ -14,6 +14,7 @@ from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of, points_of
 from pipeline.reporting.point_colours import HEIGHT, PHOTO, SIGMA, PointColours
+from pipeline.reporting.thin import evenly
 from pipeline.reporting.thinning import ShownPoints, thinned
 from pipeline.reporting.typed_arrays import singles
 
@@ -77,8 +78,7 @@ def _cloud(shown: ShownPoints, corner: Floats, colours: PointColours) -> dict[st
 def _cameras(run: RunData, ground: Ground, shown: ShownPoints, corner: Floats) -> dict[str, Any]:
     placed = placements_of(run.poses)
     cameras = camera_by_frame(run.frames, cameras_of(run.cameras))
-    names = list(placed)
-    names = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, MOST_FRAMES).round().astype(np.int64))]
+    names = evenly(np.array(list(placed), object), MOST_FRAMES).tolist()
     centres = np.array([placed[name].centre for name in names])
     span = np.ptp(np.concatenate([shown.xyz, ground.place(centres)])[:, :2], axis=0).max()
     lines = [_pyramid(placed[name], cameras[name], _PYRAMID_SHARE * float(span)) for name in names]

@@ -14,7 +14,7 @@ from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of
 from pipeline.reporting.palette import QUIET, colours, label
-from pipeline.reporting.point_colours import bar, beside_title
+from pipeline.reporting.point_colours import bar, choice
 from pipeline.reporting.scales import RISING, SIGNED, stops
 from pipeline.reporting.typed_arrays import singles, typed
 
@@ -68,7 +68,8 @@ def _spread(sums: ErrorSums) -> Figure:
     layout = {
         "xaxis": {"title": {"text": "signed error (% of the reference)"}, "range": [-limit, limit]},
         "yaxis": {"title": {"text": "share of kept pixels per bin (%)"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"},
+        "legend": {"orientation": "h", "x": 0.0, "yref": "container", "y": 0.01, "yanchor": "bottom"},
+        "margin": {"b": 110},
     }
     return Figure(
         "error-spread",
@@ -85,62 +86,57 @@ def _over_image(sums: ErrorSums) -> Figure:
     with np.errstate(invalid="ignore", divide="ignore"):
         means = np.where(sums.image_n >= _LEAST, 100.0 * sums.image_sum / sums.image_n, np.nan)
     width, height = sums.image_px
+    top = _cell_limit(means)
     down, across = means.shape[1:]
-    columns = min(len(sums.methods), 2 if len(sums.methods) in (2, 4) else 3)
-    rows = -(-len(sums.methods) // columns)
-    layout: dict[str, Any] = {
-        "coloraxis": {
-            "cmin": 0.0,
-            "cmax": _cell_limit(means),
+    traces = [
+        {
+            "type": "heatmap",
+            "name": label(name),
+            "z": singles(cells),
+            "x0": width / across / 2.0 - 0.5,
+            "dx": width / across,
+            "y0": height / down / 2.0 - 0.5,
+            "dy": height / down,
+            "zmin": 0.0,
+            "zmax": top,
             "colorscale": stops(RISING),
             "colorbar": bar("mean |error| (% of the reference)"),
-        },
-        "grid": {"rows": rows, "columns": columns, "pattern": "independent", "ygap": 0.4},
-        "annotations": [],
-        "margin": {"t": 30},
-    }
-    traces = []
-    for m, (name, cells) in enumerate(zip(sums.methods, means, strict=True)):
-        number = str(m + 1) if m else ""
-        traces.append(
-            {
-                "type": "heatmap",
-                "name": label(name),
-                "z": singles(cells),
-                "x0": width / across / 2.0 - 0.5,
-                "dx": width / across,
-                "y0": height / down / 2.0 - 0.5,
-                "dy": height / down,
-                "xaxis": f"x{number}",
-                "yaxis": f"y{number}",
-                "coloraxis": "coloraxis",
-                "hoverongaps": False,
-                "hovertemplate": "u %{x:.0f} px, v %{y:.0f} px: %{z:.2f} %<extra>" + label(name) + "</extra>",
-            }
-        )
-        axis = {"constrain": "domain", "zeroline": False, "showgrid": False, "nticks": 6}
-        layout[f"xaxis{number}"] = {
-            **axis,
-            "title": {"text": "column u (px)", "standoff": 4},
-            "range": [-0.5, width - 0.5],
+            "visible": m == 0,
+            "hoverongaps": False,
+            "hovertemplate": "u %{x:.0f} px, v %{y:.0f} px: %{z:.2f} %<extra>" + label(name) + "</extra>",
         }
-        layout[f"yaxis{number}"] = {
-            **axis,
+        for m, (name, cells) in enumerate(zip(sums.methods, means, strict=True))
+    ]
+    layout = {
+        # The cells stand beside their colour bar, however wide the page.
+        "xaxis": {
+            "title": {"text": "column u (px)"},
+            "range": [-0.5, width - 0.5],
+            "constrain": "domain",
+            "constraintoward": "right",
+            "showgrid": False,
+            "zeroline": False,
+        },
+        "yaxis": {
             "title": {"text": "row v (px)"},
             "range": [height - 0.5, -0.5],
-            "scaleanchor": f"x{number}",
-        }
-        above = {"xref": f"x{number} domain", "yref": f"y{number} domain", "x": 0.5, "y": 1.0, "yanchor": "bottom"}
-        layout["annotations"].append({"text": label(name), "showarrow": False, **above})
+            "scaleanchor": "x",
+            "constrain": "domain",
+            "showgrid": False,
+            "zeroline": False,
+        },
+        "updatemenus": _menus(sums.methods, 0),
+        "margin": {"t": 56},
+    }
     return Figure(
         "error-image",
         "Errors over the image",
         "Mean absolute error of the kept depths in cells of the image, all frames together. A band across the image "
         "is where the geometry is weak (near the epipole or the trifocal plane); a ring or a corner is the lens. "
-        "Empty cells have too few pixels.",
+        "Empty cells have too few pixels; the list chooses the method.",
         tuple(traces),
         layout,
-        80 + rows * round((900 / columns) * height / width),
+        500,
     )
 
 
@@ -192,13 +188,14 @@ def _on_ground(run: RunData, sums: ErrorSums, ground: Ground) -> Figure:
         },
         "updatemenus": _menus(sums.methods, 1),
         "showlegend": False,
-        "margin": {"t": 48},
+        "margin": {"t": 56},
+        "modebar": {"remove": ["select2d", "lasso2d"]},
     }
     return Figure(
         "error-plan",
         "Errors on the ground",
         f"Mean signed error of the kept depths in cells of {plan.edge:g} m at the place of the reference: red is too "
-        "far, blue too near. Triangles are the frames.",
+        "far, blue too near. Triangles are the frames; the list chooses the method.",
         tuple(traces),
         layout,
         560,
@@ -212,7 +209,7 @@ def _cell_limit(means: Floats) -> float:
 
 
 def _menus(methods: Sequence[str], others: int) -> list[dict[str, Any]]:
-    """Buttons that show one method's cells, and always the last `others` traces."""
+    """A list that shows one method's cells, and always the last `others` traces."""
     if len(methods) < 2:
         return []
     buttons = [
@@ -223,4 +220,4 @@ def _menus(methods: Sequence[str], others: int) -> list[dict[str, Any]]:
         }
         for shown, name in enumerate(methods)
     ]
-    return [beside_title(buttons)]
+    return [choice(buttons, listed=True)]

@@ -12,6 +12,7 @@ from pipeline.reporting.figure import Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.ground import Ground, ground_of, points_of
 from pipeline.reporting.point_colours import HEIGHT, PHOTO, SIGMA, PointColours
+from pipeline.reporting.thin import evenly
 from pipeline.reporting.thinning import ShownPoints, thinned
 from pipeline.reporting.typed_arrays import typed
 
@@ -80,12 +81,7 @@ def _pairs(run: RunData, ground: Ground) -> list[dict[str, Any]]:
     placed = np.array([one in centres and other in centres for one, other in zip(*ends, strict=True)], np.bool_)
     selected = np.asarray(column(run.pairs, "selected"), np.bool_)
     rejected = np.flatnonzero(placed & ~selected)
-    few = (
-        rejected[np.unique(np.linspace(0, len(rejected) - 1, MOST_REJECTED).round().astype(np.int64))]
-        if len(rejected)
-        else rejected
-    )
-    drawn = np.isin(np.arange(len(placed)), few)
+    drawn = np.isin(np.arange(len(placed)), evenly(rejected, MOST_REJECTED))
 
     def lines(which: Bools) -> Floats:
         both = np.array([[centres[name] for name in end[which]] for end in ends]).reshape(2, -1, 3)
@@ -155,7 +151,8 @@ def _layout(ground: Ground, colours: PointColours | None) -> dict[str, Any]:
             "scaleratio": 1,
         },
         "updatemenus": [] if colours is None else [colours.menu(0)],
-        "legend": {"orientation": "h", "x": 1.0, "xanchor": "right", "y": 1.0, "yanchor": "bottom"},
+        "legend": {"orientation": "h", "x": 0.0, "yref": "container", "y": 0.01, "yanchor": "bottom"},
         "hovermode": "closest",
-        "margin": {"t": 56},
+        "margin": {"t": 56, "b": 96},
+        "modebar": {"remove": ["select2d", "lasso2d"]},
     }

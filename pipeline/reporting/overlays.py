@@ -21,9 +21,10 @@ from pipeline.geometry.arrays import Bytes, Floats
 from pipeline.matching.images import read_colour
 from pipeline.reporting.figure import Figure, OverlayRow
 from pipeline.reporting.gathered import RunData
-from pipeline.reporting.painting import backdrop, data_uri, painted, small
+from pipeline.reporting.painting import backdrop, painted, small
 from pipeline.reporting.palette import label
-from pipeline.reporting.scales import DEPTH, SIGNED, coloured, stops
+from pipeline.reporting.panels import colour_bar, panel, panel_width_px
+from pipeline.reporting.scales import DEPTH, SIGNED, coloured
 from pipeline.scoring.lines import frames_in
 
 SHOWN = 6
@@ -31,8 +32,6 @@ SHOWN = 6
 
 _DLT = "dlt"
 _ROWS = ("frame_id", "method", "u", "v", "depth_m", "sigma_depth_m")
-_PANEL_PX = 400
-_MARGIN = {"l": 52, "r": 76, "t": 8, "b": 44}
 # What a colour bar spans: most of the values, not the few that are far off.
 _DEPTH_SHARES = (2.0, 98.0)
 _ERROR_SHARE = 90.0
@@ -65,6 +64,11 @@ class _Dots:
             columns(table, ("u", "v"))[order], np.asarray(column(table, "depth_m"), np.float64)[order], reference[order]
         )
 
+    @staticmethod
+    def none() -> _Dots:
+        """No depths."""
+        return _Dots(np.empty((0, 2)), np.empty(0), np.empty(0))
+
     @property
     def error_percent(self) -> Floats:
         """(n,) signed relative error."""
@@ -80,11 +84,13 @@ class _Sheet:
         frame_id: The frame.
         full: Width and height of its photo, px.
         ground: The picture that is painted on.
+        width_px: About how wide a panel is on the page.
     """
 
     frame_id: str
     full: tuple[int, int]
     ground: Bytes
+    width_px: float
 
 
 def rows(run: RunData) -> list[OverlayRow]:
@@ -103,14 +109,31 @@ def rows(run: RunData) -> list[OverlayRow]:
     if not chosen:
         return []
     depths, scored = _depths(run, list(chosen)), _scored(run, list(chosen))
+    # Learned methods stand among the scored depths alone.
+    shown = {frame_id: {**scored.get(frame_id, {}), **depths.get(frame_id, {})} for frame_id in chosen}
+    published = _published(run)
+    methods = sorted(
+        {name for of_frame in shown.values() for name in of_frame},
+        key=lambda name: (name != published, name != _DLT, name.startswith(published), name),
+    )
+    judged = [name for name in methods if name in (published, _DLT) and any(name in one for one in scored.values())]
     cameras = camera_by_frame(run.frames, cameras_of(run.cameras))
     found = []
     for frame_id, why in chosen.items():
-        camera = cameras[frame_id]
-        photo = _photo(run, frame_id)
-        full = (camera.width, camera.height)
-        sheet = _Sheet(frame_id, full, backdrop(photo, full))
-        panels = _panels(run, sheet, photo, depths.get(frame_id, {}), scored.get(frame_id, {}))
+        full, photo = (cameras[frame_id].width, cameras[frame_id].height), _photo(run, frame_id)
+        width_px = panel_width_px(1 + len(methods) + len(judged))
+        sheet = _Sheet(frame_id, full, backdrop(photo, full), width_px)
+        dots = {name: shown[frame_id].get(name, _Dots.none()) for name in methods}
+        errors = {name: scored.get(frame_id, {}).get(name, _Dots.none()) for name in judged}
+        span, limit = (
+            _depth_range(dots.get(published, _Dots.none()), list(dots.values())),
+            _error_limit(list(errors.values())),
+        )
+        panels = (
+            _photo_panel(sheet, photo),
+            *(_depth_panel(sheet, name, of_method, span) for name, of_method in dots.items()),
+            *(_error_panel(sheet, name, of_method, limit) for name, of_method in errors.items()),
+        )
         found.append(OverlayRow(frame_id, why, panels))
     return found
 
@@ -191,23 +214,9 @@ def _by_frame(path: Path, name: str, frames: Sequence[str], wanted: Sequence[str
     return found
 
 
-def _panels(
-    run: RunData, sheet: _Sheet, photo: Bytes | None, depths: Mapping[str, _Dots], scored: Mapping[str, _Dots]
-) -> tuple[Figure, ...]:
-    published = _published(run)
-    shown = {**scored, **depths}
-    methods = sorted(shown, key=lambda name: (name != published, name != _DLT, name.startswith(published), name))
-    panels = [_photo_panel(sheet, photo)]
-    low, high = _depth_range(shown.get(published), list(shown.values()))
-    panels += [_depth_panel(sheet, name, shown[name], low, high) for name in methods]
-    judged = [name for name in dict.fromkeys((published, _DLT)) if name in scored and len(scored[name].depth_m)]
-    limit = _error_limit([scored[name] for name in judged])
-    return (*panels, *(_error_panel(sheet, name, scored[name], limit) for name in judged))
-
-
-def _depth_range(published: _Dots | None, others: Sequence[_Dots]) -> tuple[float, float]:
+def _depth_range(published: _Dots, others: Sequence[_Dots]) -> tuple[float, float]:
     """What the colours of a row span: the published depths, or all where there are none."""
-    values = published.depth_m if published is not None else np.concatenate([np.empty(0), *(d.depth_m for d in others)])
+    values = published.depth_m if len(published.depth_m) else np.concatenate([dots.depth_m for dots in others])
     if not len(values):
         return 0.0, 1.0
     low, high = np.percentile(values, _DEPTH_SHARES)
@@ -215,95 +224,38 @@ def _depth_range(published: _Dots | None, others: Sequence[_Dots]) -> tuple[floa
 
 
 def _error_limit(judged: Sequence[_Dots]) -> float:
-    """Where the colours of errors end, %: of one or two digits, and wide enough for most."""
+    """Where the colours of errors end, %: a round number, and wide enough for most."""
     errors = np.concatenate([np.empty(0), *(np.abs(dots.error_percent) for dots in judged)])
     if not len(errors):
         return 1.0
     wanted = max(float(np.percentile(errors, _ERROR_SHARE)), 1e-3)
     decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(decade * next(step for step in (1.0, 2.0, 3.0, 5.0, 10.0) if step * decade >= wanted * (1.0 - 1e-9)))
+    return float(decade * next(step for step in (1.0, 2.0, 3.0, 5.0, 10.0) if step * decade >= wanted))
 
 
 def _photo_panel(sheet: _Sheet, photo: Bytes | None) -> Figure:
     if photo is None:
-        return _panel(sheet, "photo", "Photo", "Not found where it was; the ground is plain grey.", sheet.ground)
+        return _panel(sheet, "photo", "Photo", "Not found where it was.", sheet.ground)
     return _panel(sheet, "photo", "Photo", f"{sheet.frame_id} as taken.", photo)
 
 
-def _depth_panel(sheet: _Sheet, method: str, dots: _Dots, low: float, high: float) -> Figure:
-    picture = painted(sheet.ground, sheet.full, dots.pixels, coloured(dots.depth_m, low, high, DEPTH))
-    caption = f"{len(dots.depth_m):,} depths; dark where there is none."
-    return _panel(sheet, method, label(method), caption, picture, _bar("depth (m)", low, high, DEPTH))
+def _depth_panel(sheet: _Sheet, method: str, dots: _Dots, span: tuple[float, float]) -> Figure:
+    picture = painted(sheet.ground, sheet.full, dots.pixels, coloured(dots.depth_m, *span, DEPTH))
+    caption = f"{len(dots.depth_m):,} depths."
+    return _panel(sheet, method, label(method), caption, picture, colour_bar("depth (m)", *span, DEPTH))
 
 
 def _error_panel(sheet: _Sheet, method: str, dots: _Dots, limit: float) -> Figure:
-    known = np.flatnonzero(np.isfinite(dots.error_percent))
     # The largest errors last, so that none of them hides.
-    order = known[np.argsort(np.abs(dots.error_percent[known]), kind="stable")]
+    order = np.argsort(np.abs(dots.error_percent), kind="stable")
     colours = coloured(dots.error_percent[order], -limit, limit, SIGNED)
     picture = painted(sheet.ground, sheet.full, dots.pixels[order], colours)
-    caption = f"{len(order):,} pixels with a reference; red too far, blue too near."
-    bar = _bar("error (% of the reference)", -limit, limit, SIGNED)
+    caption = f"{len(order):,} pixels; red is too far."
+    bar = colour_bar("error (% of the reference)", -limit, limit, SIGNED)
     return _panel(sheet, f"{method}-error", f"Error of {label(method)}", caption, picture, bar)
-
-
-def _bar(title: str, low: float, high: float, scale: Bytes) -> dict[str, Any]:
-    """A colour bar, through a marker that is not there."""
-    return {
-        "type": "scatter",
-        "x": [None],
-        "y": [None],
-        "mode": "markers",
-        "hoverinfo": "skip",
-        "showlegend": False,
-        "marker": {
-            "color": [low],
-            "cmin": low,
-            "cmax": high,
-            "colorscale": stops(scale),
-            "showscale": True,
-            "colorbar": {"title": {"text": title, "side": "right"}, "thickness": 12, "xpad": 6, "outlinewidth": 0},
-        },
-    }
 
 
 def _panel(
     sheet: _Sheet, name: str, title: str, caption: str, picture: Bytes, bar: Mapping[str, Any] | None = None
 ) -> Figure:
-    width, height = sheet.full
-    image = {
-        "source": data_uri(picture),
-        "xref": "x",
-        "yref": "y",
-        # Pixel (0, 0) is the centre of the top-left one, so the picture begins half a pixel before it.
-        "x": -0.5,
-        "y": -0.5,
-        "sizex": width,
-        "sizey": height,
-        "sizing": "stretch",
-        "layer": "below",
-    }
-    axis = {"zeroline": False, "showgrid": False, "constrain": "domain", "nticks": 5}
-    layout = {
-        "images": [image],
-        "xaxis": {**axis, "title": {"text": "column u (px)"}, "range": [-0.5, width - 0.5]},
-        "yaxis": {
-            **axis,
-            "title": {"text": "row v (px)"},
-            "range": [height - 0.5, -0.5],
-            "scaleanchor": "x",
-        },
-        "margin": _MARGIN,
-        "showlegend": False,
-    }
-    # Without a trace plotly draws no axes.
-    nothing = {"type": "scatter", "x": [None], "y": [None], "mode": "markers", "hoverinfo": "skip"}
-    inner = (_PANEL_PX - _MARGIN["l"] - _MARGIN["r"]) * height / width
-    return Figure(
-        f"overlay-{sheet.frame_id}-{name}",
-        title,
-        caption,
-        (bar or nothing,),
-        layout,
-        round(inner) + _MARGIN["t"] + _MARGIN["b"],
-    )
+    return panel(f"overlay-{sheet.frame_id}-{name}", title, caption, picture, sheet.full, sheet.width_px, bar)

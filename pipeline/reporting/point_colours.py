@@ -45,7 +45,7 @@ class PointColours:
         for name in self.order:
             change = {f"marker.{key}": [value] for key, value in self._of(name).items()}
             buttons.append({"label": name, "method": "restyle", "args": [change, [trace]]})
-        return beside_title(buttons)
+        return choice(buttons, listed=False)
 
     def _of(self, name: str) -> dict[str, Any]:
         if name == PHOTO:
@@ -55,12 +55,18 @@ class PointColours:
         return _scaled(self.shown.sigma_m, "sigma of the position (m)")
 
 
-def beside_title(buttons: list[dict[str, Any]]) -> dict[str, Any]:
-    """Buttons in a row above the left end of a figure."""
+def choice(buttons: list[dict[str, Any]], *, listed: bool) -> dict[str, Any]:
+    """An entry of plotly's `updatemenus` above the left end of a figure.
+
+    Args:
+        buttons: The choices.
+        listed: A list that opens, for what would not fit in a row.
+    """
     place = {"x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": 6}}
-    # plotly lights up the pressed button whatever the page's colours, so that the letters on it have to be dark.
+    # plotly lights up what is pressed whatever the page's colours, so that the letters on it have to be dark.
     look = {"bgcolor": "#d5dce4", "bordercolor": "#8f9aa3", "font": {"color": "#1b2733", "size": 12}}
-    return {"type": "buttons", "direction": "right", "buttons": buttons, **place, **look}
+    form = {"type": "dropdown", "direction": "down"} if listed else {"type": "buttons", "direction": "right"}
+    return {**form, "buttons": buttons, **place, **look}
 
 
 def bar(title: str) -> dict[str, Any]:

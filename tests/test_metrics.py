@@ -1,4 +1,4 @@
-"""Depth metrics by hand, against an independent loop, and over any split into shards."""
+"""Depth metrics against scikit-learn, calibration on errors of known sigma, and all sums over any split into shards."""
 
 import math
 
@@ -7,11 +7,13 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn import metrics as learned
 
 from pipeline.engine.errors import InputError
-from pipeline.scoring.calibration import CalibrationSums, MapSums
+from pipeline.scoring.binned import range_edges_m
+from pipeline.scoring.calibration import NOMINAL, CalibrationSums, MapSums
 from pipeline.scoring.depth_rows import align
-from pipeline.scoring.metrics import DepthSums, MethodSums, usable
+from pipeline.scoring.metrics import DepthSums, GroupedSums, MethodSums, usable
 from pipeline.scoring.summary import to_json
 from schemas import DEPTHS
 
@@ -44,17 +46,40 @@ def test_delta_is_strict_and_two_sided() -> None:
 
 @given(depths)
 @settings(max_examples=60, deadline=None)
-def test_against_a_plain_loop(pairs: list[tuple[float, float]]) -> None:
+def test_against_scikit_learn(pairs: list[tuple[float, float]]) -> None:
     d, g = (np.array(x) for x in zip(*pairs, strict=True))
     found = DepthSums.of(d, g).metrics()
-    n = len(pairs)
-    assert found["abs_rel"] == pytest.approx(sum(abs(a - b) / b for a, b in pairs) / n, rel=1e-12)
-    assert found["sq_rel"] == pytest.approx(sum((a - b) ** 2 / b for a, b in pairs) / n, rel=1e-12)
-    assert found["rmse"] == pytest.approx(math.sqrt(sum((a - b) ** 2 for a, b in pairs) / n), rel=1e-12)
-    log = sum((math.log(a) - math.log(b)) ** 2 for a, b in pairs) / n
-    assert found["rmse_log"] == pytest.approx(math.sqrt(log), rel=1e-9, abs=1e-12)
+    expected = {
+        "abs_rel": learned.mean_absolute_percentage_error(g, d),
+        # A weighted mean is over the sum of its weights, SqRel over the pixels.
+        "sq_rel": learned.mean_squared_error(g, d, sample_weight=1.0 / g) * np.mean(1.0 / g),
+        "rmse": learned.root_mean_squared_error(g, d),
+        "rmse_log": learned.root_mean_squared_error(np.log(g), np.log(d)),
+        "mae": learned.mean_absolute_error(g, d),
+    }
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-9, abs=1e-12)
     for k in (1, 2, 3):
-        assert found[f"delta{k}"] == sum(max(a / b, b / a) < 1.25**k for a, b in pairs) / n
+        assert found[f"delta{k}"] == sum(max(a / b, b / a) < 1.25**k for a, b in pairs) / len(pairs)
+
+
+@given(depths, st.integers(1, 5))
+@settings(max_examples=40, deadline=None)
+def test_groups_are_sets_of_their_own(pairs: list[tuple[float, float]], count: int) -> None:
+    d, g = (np.array(x) for x in zip(*pairs, strict=True))
+    # One more group than there are, whose pixels are in none.
+    group = np.arange(len(d)) % (count + 1) - 1
+    found = GroupedSums.of(d, g, group, count)
+    alone = GroupedSums.stacked(DepthSums.of(d[group == k], g[group == k]) for k in range(count))
+    np.testing.assert_array_equal(found.n, alone.n)
+    np.testing.assert_allclose(found.sums, alone.sums, rtol=1e-13)
+    np.testing.assert_array_equal(GroupedSums.total([found, alone]).n, 2 * found.n)
+    for row, k in zip(found.metrics(), range(count), strict=True):
+        whole = DepthSums.of(d[group == k], g[group == k]).metrics()
+        assert row["n"] == whole["n"]
+        assert row.keys() == whole.keys()
+        assert [x for x in row.values() if x is not None] == pytest.approx(
+            [x for x in whole.values() if x is not None], rel=1e-12
+        )
 
 
 @given(depths, st.integers(1, 7))
@@ -93,29 +118,76 @@ def test_a_depth_that_is_none_is_never_kept() -> None:
 def test_calibration_counts_the_reference_spread() -> None:
     depth, reference = np.array([10.0, 10.0, 10.0, 10.0]), np.array([10.9, 11.9, 12.4, 11.0])
     sigma = np.array([1.0, 1.0, 1.0, np.nan])
-    assert CalibrationSums.of(depth, sigma, reference, np.zeros(4)) == CalibrationSums(3, 1, 2)
-    assert CalibrationSums.of(depth, sigma, reference, np.full(4, 0.75)) == CalibrationSums(3, 1, 3)
-    assert CalibrationSums.total([CalibrationSums(3, 1, 2), CalibrationSums(1, 1, 1)]).metrics() == {
-        "n": 4, "within_1_sigma": 0.5, "within_2_sigma": 0.75,
-    }  # fmt: skip
+    alone, with_spread = (
+        CalibrationSums.of(depth, sigma, reference, np.full(4, spread)).metrics() for spread in (0.0, 0.75)
+    )
+    assert (alone["n"], alone["within_1_sigma"], alone["within_2_sigma"]) == (3, 1 / 3, 2 / 3)
+    assert (with_spread["n"], with_spread["within_1_sigma"], with_spread["within_2_sigma"]) == (3, 1 / 3, 1.0)
 
 
 def test_gaussian_errors_are_found_calibrated() -> None:
     rng = np.random.default_rng(1)
     reference = rng.uniform(20.0, 90.0, 200_000)
-    sigma, spread = 0.02 * reference, np.full(200_000, 0.4)
+    sigma, spread = reference * np.exp(rng.uniform(-4.5, -2.5, 200_000)), np.full(200_000, 0.4)
     depth = reference + rng.normal(0.0, np.hypot(sigma, spread))
-    shares = CalibrationSums.of(depth, sigma, reference, spread).metrics()
-    assert 0.678 < shares["within_1_sigma"] < 0.688
-    assert 0.952 < shares["within_2_sigma"] < 0.957
+    found = CalibrationSums.of(depth, sigma, reference, spread).metrics()
+    assert 0.678 < found["within_1_sigma"] < 0.688
+    assert 0.952 < found["within_2_sigma"] < 0.957
+    assert [point["nominal"] for point in found["curve"]] == list(NOMINAL)
+    assert all(abs(point["observed"] - point["nominal"]) < 0.005 for point in found["curve"])
+    assert 0.98 < found["mean_square"] < 1.02
+    assert 0.98 < found["robust_mean_square"] < 1.02
+    # At either end of the sigmas that there are, bins hold those whose depths came out too short, or too long.
+    inside = [one for one in found["by_sigma"] if one["n"] > 5000 and one["to"] < 0.07]
+    assert len(inside) > 5
+    assert all(0.97 < one["observed"] / one["predicted"] < 1.03 for one in inside)
+    # Outliers carry the mean square away, the median not; sigmas of half the size make four of both.
+    depth[:2000] *= 3.0
+    found = CalibrationSums.of(depth, sigma / 2, reference, spread / 2).metrics()
+    assert found["mean_square"] > 40.0
+    assert 3.9 < found["robust_mean_square"] < 4.3
+
+
+def test_the_median_lies_within_its_bin_as_the_logarithm_goes() -> None:
+    # In sigmas: one below, four between 2^0 and 2^(1/8), three above; half of eight is 3/4 into that bin.
+    z = np.array([0.5, 1.01, 1.02, 1.03, 1.04, 2.0, 3.0, 4.0])
+    found = CalibrationSums.of(10.0 + z, np.ones(8), np.full(8, 10.0), np.zeros(8)).metrics()
+    assert found["robust_mean_square"] == pytest.approx((2.0 ** (3 / 32) / 0.6744897501960817) ** 2, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("largest", "edges"),
+    [
+        (100.0, [10.0 * k for k in range(11)]),
+        (8.0, [1.0 * k for k in range(9)]),
+        (45.0, [5.0 * k for k in range(10)]),
+        (12.5, [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 12.5]),
+        (0.3, [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3]),
+        (101.0, [0.0, 20.0, 40.0, 60.0, 80.0, 100.0, 101.0]),
+    ],
+)
+def test_range_bins_suit_the_largest_range(largest: float, edges: list[float]) -> None:
+    assert range_edges_m(largest) == pytest.approx(edges, rel=1e-14)
+
+
+@given(st.floats(0.01, 1e5))
+def test_there_are_at_most_ten_range_bins(largest: float) -> None:
+    edges = np.array(range_edges_m(largest))
+    assert 4 <= len(edges) <= 11
+    assert (edges[0], edges[-1]) == (0.0, largest)
+    assert np.all(np.diff(edges) > 0.0)
 
 
 def test_map_error_splits_along_the_ray() -> None:
     rays = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0]])
     found = MapSums.of(np.array([12.0, 7.0]), np.array([10.0, 10.0]), rays).metrics()
-    assert found == pytest.approx(
-        {"n": 2, "rmse_z_m": math.sqrt(1.6**2 / 2), "rmse_h_m": math.sqrt((1.2**2 + 9.0) / 2)}, rel=1e-14
-    )
+    expected = {
+        "n": 2,
+        "rmse_z_m": math.sqrt(1.6**2 / 2),
+        "rmse_h_m": math.sqrt((1.2**2 + 9.0) / 2),
+        "rmse_3d_m": math.sqrt((4.0 + 9.0) / 2),
+    }
+    assert found == pytest.approx(expected, rel=1e-14)
 
 
 def depth_rows(rows: list[tuple[str, float, str, float | None, bool]]) -> pa.Table:

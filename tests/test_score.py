@@ -75,8 +75,9 @@ class FakeContext:
     def count_items(self, total: int, failed: int) -> None:
         self.items = (total, failed)
 
-    def map(self, function: Callable, items: Iterable, *, shard: int, label: str) -> Iterator[Any]:
+    def map(self, function: Callable, items: Iterable, *, shard: int, label: str, here: bool = False) -> Iterator[Any]:
         assert label
+        assert not here
         listed: Sequence = list(items)
         size = self.shard or shard
         return self.executor.map(function, [listed[i : i + size] for i in range(0, len(listed), size)])
@@ -172,14 +173,18 @@ def test_known_depths_get_known_scores(tmp_path: Path) -> None:
     assert dlt["common"]["n"] == epi["common"]["n"] == epi["all"]["n"] < dlt["all"]["n"]
     assert 800 < dlt["all"]["n"] <= 1200
     # 0.1 g of error against 0.088 g of sigma.
-    assert metrics["calibration"] == {
-        "method": "epitransfer",
-        "n": epi["all"]["n"],
-        "within_1_sigma": 0.0,
-        "within_2_sigma": 1.0,
-        # Here the poses have no error.
-        "without_pose": {"n": epi["all"]["n"], "within_1_sigma": 0.0, "within_2_sigma": 1.0},
-    }
+    calibration = metrics["calibration"]
+    assert (calibration["method"], calibration["n"]) == ("epitransfer", epi["all"]["n"])
+    assert (calibration["within_1_sigma"], calibration["within_2_sigma"]) == (0.0, 1.0)
+    # Here the poses have no error.
+    assert calibration.pop("without_pose") | {"method": "epitransfer"} == calibration
+    assert calibration["mean_square"] == pytest.approx((0.1 / 0.088) ** 2, rel=0.01)
+    fullest = max(calibration["by_sigma"], key=lambda one: one["n"])
+    assert (fullest["predicted"], fullest["observed"]) == pytest.approx((0.08, 0.1 / 1.1), rel=0.01)
+    # Parallax is 3 degrees everywhere, and the ground at most 100 m away.
+    assert [one["from"] for one in epi["by_parallax"] if one["all"]["n"]] == [2.0]
+    assert sum(one["all"]["n"] for one in epi["by_range"]) == epi["all"]["n"]
+    assert 0.9 < epi["coverage"]["image_share"] <= dlt["coverage"]["image_share"] == 1.0
     assert metrics["map"]["rmse_z_m"] == pytest.approx(0.1 * HEIGHT_M, abs=0.01)
     assert 1.0 < metrics["map"]["rmse_h_m"] < 6.0
     assert [row["frame_id"] for row in epi["per_frame"]] == list(FRAMES_AT)
@@ -287,7 +292,7 @@ def test_half_a_flight_without_lidar_is_told(tmp_path: Path) -> None:
     poses[2]["east_m"] = 3000.0
     context.tables["poses"] = POSES.from_rows(poses)
     STAGE.run(config(lidar), context)
-    assert context.recorded["frames_that_see_no_lidar"] == ["f2"]
+    assert context.recorded["frames_that_see_no_truth"] == ["f2"]
     assert "1 of 3 frames" in context.warnings[0]
     last = scores(context)["methods"]["dlt"]["per_frame"][2]
     assert (last["n_scored"], last["kept_share"], last["all"]["abs_rel"]) == (0, None, None)

@@ -15,8 +15,9 @@ from pipeline.geometry.arrays import Floats, Ints
 NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 # How many sigmas are the bound of each count: of one and two sigma, and of each nominal share of a Gaussian.
 _BOUNDS = (1.0, 2.0, *(NormalDist().inv_cdf(0.5 + 0.5 * p) for p in NOMINAL))
-# Bins of the predicted relative sigma.
-SIGMA_EDGES = (0.0, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, math.inf)
+# Bins of the predicted relative sigma: ten in a decade, at preferred numbers (ISO 3, series R10).
+_PREFERRED = (1.0, 1.25, 1.6, 2.0, 2.5, 3.15, 4.0, 5.0, 6.3, 8.0)
+SIGMA_EDGES = (0.0, *(x / decade for decade in (1000.0, 100.0, 10.0) for x in _PREFERRED), 1.0, math.inf)
 # Errors in sigmas are counted in bins of an eighth of an octave, from which their median follows.
 _PER_OCTAVE = 8
 _OCTAVES = 8
@@ -33,7 +34,7 @@ class CalibrationSums:
         within: (12,) those whose error is at most one and two sigmas, and at most the bound of each nominal share.
         squares: Sum of squared errors in sigmas.
         histogram: (128,) counts of errors in sigmas, 2^-8 to 2^8; what is beyond is in the first or last bin.
-        by_sigma: (15, 3) pixels and sums of the squared relative sigma and error, by bins of the relative sigma.
+        by_sigma: (32, 3) pixels and sums of the squared relative sigma and error, by bins of the relative sigma.
     """
 
     n: int
@@ -91,7 +92,7 @@ class CalibrationSums:
             `n`; `within_1_sigma` and `within_2_sigma`, which a Gaussian has as 0.683 and 0.954; `curve` of the observed
             to the nominal share; `mean_square` of the errors in sigmas, and `robust_mean_square`, their squared median
             over that of a Gaussian, both 1 where sigmas are honest; `by_sigma`, rms predicted and observed error in
-            shares of the estimated depth.
+            shares of the estimated depth, for the bins that have a pixel.
         """
         shares = [int(count) / self.n if self.n else None for count in self.within]
         median = self._median()
@@ -112,10 +113,11 @@ class CalibrationSums:
                 "from": low,
                 "to": high if math.isfinite(high) else None,
                 "n": int(n),
-                "predicted": math.sqrt(predicted / n) if n else None,
-                "observed": math.sqrt(observed / n) if n else None,
+                "predicted": math.sqrt(predicted / n),
+                "observed": math.sqrt(observed / n),
             }
             for (low, high), (n, predicted, observed) in zip(spans, self.by_sigma.tolist(), strict=True)
+            if n
         ]
 
     def _median(self) -> float | None:

@@ -20,9 +20,9 @@ from pipeline.lidar.tile_crs import local_tile_crs, tile_crs
 CHUNK_POINTS = 1_000_000
 SUFFIXES = (".las", ".laz")
 # ASPRS LAS 1.4 R15, table 17: low point (noise), high noise.
-_NOISE_CLASSES = (7, 18)
+NOISE_CLASSES = (7, 18)
 # What laspy and its decoder (RuntimeError) raise on bytes that are not a tile.
-_UNREADABLE = (laspy.errors.LaspyException, RuntimeError, OSError, ValueError, TypeError, struct.error, EOFError,
+UNREADABLE = (laspy.errors.LaspyException, RuntimeError, OSError, ValueError, TypeError, struct.error, EOFError,
                KeyError, IndexError, OverflowError, MemoryError)  # fmt: skip
 
 
@@ -143,8 +143,8 @@ def read_header(path: Path) -> laspy.LasHeader:
             header = reader.header
             bounds = [float(x) for corner in (header.mins, header.maxs) for x in corner]
             count = int(header.point_count)
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
     if count and not np.all(np.isfinite(bounds)):
         raise InputError(
             "E-LIDAR-08", "the tile's header has no finite bounds", where=str(path), found=str(bounds),
@@ -176,8 +176,8 @@ def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_points: int = C
                 points = _wanted(chunk, lower, upper)
                 if len(points):
                     yield points
-    except _UNREADABLE as error:
-        raise _unreadable(tile.path, error) from error
+    except UNREADABLE as error:
+        raise unreadable(tile.path, error) from error
     if seen < tile.point_count:
         raise InputError(
             "E-LIDAR-02", "the tile is cut short", where=str(tile.path), found=f"{seen:,} returns",
@@ -188,13 +188,14 @@ def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_points: int = C
 def _wanted(chunk: laspy.ScaleAwarePointRecord, lower: Floats, upper: Floats) -> Floats:
     x, y = np.asarray(chunk.x, np.float64), np.asarray(chunk.y, np.float64)
     keep: Bools = (x >= lower[0]) & (x <= upper[0]) & (y >= lower[1]) & (y <= upper[1])
-    keep &= ~np.isin(np.asarray(chunk.classification), _NOISE_CLASSES) & ~np.asarray(chunk.withheld, np.bool_)
+    keep &= ~np.isin(np.asarray(chunk.classification), NOISE_CLASSES) & ~np.asarray(chunk.withheld, np.bool_)
     index = np.flatnonzero(keep)
     points = np.column_stack([x[index], y[index], np.asarray(chunk.z, np.float64)[index]])
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _unreadable(path: Path, error: BaseException) -> InputError:
+def unreadable(path: Path, error: BaseException) -> InputError:
+    """A tile that laspy or its decoder cannot read."""
     return InputError(
         "E-LIDAR-02", "the LiDAR tile cannot be read", where=str(path), found=str(error) or type(error).__name__,
         expected="a LAS, LAZ or COPC file, whole", hint="copy the file again, or take it out of score.lidar",

@@ -38,7 +38,7 @@ _BACKBONE = {
 
 
 def zoedepth() -> ZoeDepthForDepthEstimation:
-    """A ZoeDepth with one metric head."""
+    """A ZoeDepth with two metric heads and the network that chooses between them, as zoedepth-nyu-kitti."""
     backbone = BeitConfig(
         **_BACKBONE,
         image_size=64,
@@ -54,7 +54,14 @@ def zoedepth() -> ZoeDepthForDepthEstimation:
         num_relative_features=8,
         bin_embedding_dim=8,
         num_attractors=[4, 2, 2, 1],
-        bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": float(MAX_DEPTH_M)}],
+        bin_configurations=[
+            {"name": "nyu", "n_bins": 8, "min_depth": 0.001, "max_depth": 10.0},
+            {"name": "kitti", "n_bins": 8, "min_depth": 0.001, "max_depth": float(MAX_DEPTH_M)},
+        ],
+        num_patch_transformer_layers=4,
+        patch_transformer_hidden_size=128,  # this and the four layers are what the choosing network takes
+        patch_transformer_intermediate_size=_WIDTH,
+        patch_transformer_num_attention_heads=2,
     )
     return ZoeDepthForDepthEstimation(config)
 

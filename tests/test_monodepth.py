@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +26,7 @@ from pipeline.matching.weights import files as weights
 from pipeline.monodepth import found as finding
 from pipeline.monodepth import known
 from pipeline.monodepth.baselines import BaselineSetting, depths_at
-from pipeline.monodepth.found import FoundModel, find_models, read_model
+from pipeline.monodepth.found import FoundModel, find_models, model_files, read_model
 from pipeline.monodepth.network import MonoDepth
 from pipeline.monodepth.sampling import sampled
 
@@ -183,7 +184,8 @@ def test_a_depth_that_is_none_spreads_no_further_than_its_neighbours(bad: float)
 # --- the baselines of a run ---
 
 
-def test_depths_at_pixels_of_a_photo(tiny: Path, image: Bytes, tmp_path: Path) -> None:
+def test_depths_at_pixels_of_a_photo(tiny: Path, image: Bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "socket", None)  # whoever asked the network would fail
     setting = BaselineSetting.find(NAMES, tiny, "cpu")
     assert pickle.loads(pickle.dumps(setting)) == setting  # noqa: S301 - our own
     path = tmp_path / "photo.png"
@@ -240,6 +242,9 @@ def test_places_in_their_order(tiny: Path, nowhere: Path, monkeypatch: pytest.Mo
         return model.folder, model.origin
 
     assert found() == (snapshot, finding.HUB)
+    only_asked = nowhere / "hub" / "models--Intel--zoedepth-nyu-kitti"
+    shutil.copytree(hub, only_asked)
+    (only_asked / "snapshots" / ("0" * 40) / known.WEIGHTS).unlink()
     assert found() == (snapshot, finding.HUB)
     cached = laid(nowhere / "cache" / "zoedepth-nyu", source)
     assert found() == (cached, "cache")
@@ -248,6 +253,9 @@ def test_places_in_their_order(tiny: Path, nowhere: Path, monkeypatch: pytest.Mo
     assert found() == (named, "$EPITRANSFER_WEIGHTS")
     assert found(tiny) == (source, finding.CONFIGURED)
     assert found(source) == (source, finding.CONFIGURED)
+    assert model_files(["zoedepth"]) == [named / "config.json", named / known.PROCESSOR, named / known.WEIGHTS]
+    assert model_files(NAMES, source)[0] == source / "config.json"
+    assert model_files(["depth-anything-v2"], nowhere) == []
     assert found(tiny / "depth-anything-v2" / "..") == (tiny / "depth-anything-v2" / ".." / "zoedepth", "score.models")
 
 

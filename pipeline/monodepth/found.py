@@ -108,9 +108,25 @@ def _find(baseline: str, stated: Path | None) -> FoundModel:
         "E-BASELINE-01",
         f"the model of {baseline} is missing",
         found="none in " + ", ".join([*looked, *map(str, weight_places()), HUB]),
-        expected=f"a folder with {CONFIG}, {PROCESSOR} and {WEIGHTS}, for example {first.page}",
+        expected=f"a folder {baseline} or {first.name} with {CONFIG}, {PROCESSOR} and {WEIGHTS}, as {first.page}",
         hint=f"epitransfer models fetch {baseline}; or name the folder it lies in: --set {CONFIGURED}=FOLDER",
     )
+
+
+def model_files(baselines: Sequence[str], folder: Path | str | None = None) -> list[Path]:
+    """The files that decide what some baselines say, for a stage's staleness key.
+
+    Args:
+        baselines: As `find_models` takes them.
+        folder: The value of `score.models`.
+
+    Returns:
+        Those of the models found. What is missing is told by `find_models`.
+    """
+    stated = None if folder is None else Path(folder).expanduser()
+    folders = [next(candidates(name, stated), None) for name in baselines]
+    files = [found[0] / name for found in folders if found for name in (CONFIG, PROCESSOR, WEIGHTS)]
+    return [file for file in files if file.is_file()]
 
 
 def candidates(baseline: str, stated: Path | None = None) -> Iterator[tuple[Path, str]]:
@@ -133,8 +149,9 @@ def in_hub_cache(repository: str) -> Path | None:
         return None
     from huggingface_hub import try_to_load_from_cache  # noqa: PLC0415 - an optional part
 
-    config = try_to_load_from_cache(repository, CONFIG)
-    return Path(config).parent if isinstance(config, str) else None
+    # Whoever only asked what a model is has its configuration there, too.
+    weights = try_to_load_from_cache(repository, WEIGHTS)
+    return Path(weights).parent if isinstance(weights, str) else None
 
 
 def _serves(folder: Path) -> str | None:

@@ -25,7 +25,8 @@ class MonoDepth:
 
     Both baselines are trained on depth along the optical axis, not on distance from the camera's centre: NYU Depth v2
     and KITTI hold it (ZoeDepth), Virtual KITTI 2 too, and Hypersim's distances are made into it before Depth Anything
-    V2 is trained on them.
+    V2 is trained on them. Each image is seen once: ZoeDepth's authors also average with its mirror image, which the
+    library leaves out by default.
 
     Source: Bhat et al., ZoeDepth, arXiv 2302.12288; Yang et al., Depth Anything V2, arXiv 2406.09414, and its
     repository's metric_depth/dataset.
@@ -50,11 +51,13 @@ class MonoDepth:
             image: (height, width, 3) red, green, blue.
 
         Returns:
-            (height, width) depths along the optical axis (m).
+            (height, width) depths along the optical axis (m); bicubic between those of the network, so that they may
+            overshoot beside an edge.
 
         Raises:
             ResourceError: The network does not fit into memory.
         """
+        # One at a time: ZoeDepth chooses its head, indoor or outdoor, for all images of a batch together.
         return in_batches(self._run, [image], self._device, 1, [])[0]
 
     def _run(self, images: Sequence[Bytes], device: torch.device) -> list[Singles]:

@@ -71,7 +71,21 @@ class TestDistances:
         assert found["within_lod_share"] == 1.0 - found["significant_share"]
         assert found["mean_m"] == pytest.approx(0.1, abs=0.02)
 
-    def test_as_py4dgeo_measures_them(self) -> None:
+    def test_a_wall_without_returns_does_not_lift_the_ground(self) -> None:
+        rng = np.random.default_rng(18)
+        ground = rough(6000, 20.0, 0.0, 1)
+        returns = ground[ground[:, 0] < 0.0]
+        wall = np.column_stack([np.zeros(2000), rng.uniform([-9.0, 0.3], [9.0, 3.0], (2000, 2))])
+        flat = rough(1000, 18.0, 0.0, 2)
+        found = metrics(sums(cloud(np.concatenate([wall, flat[flat[:, 0] < 0.0]]), 0.1), cloud(returns, 0.03)))
+        assert 100 < found["n"] < 200
+        assert found["median_m"] == pytest.approx(0.0, abs=1e-6)
+        # A few places look as if there were ground behind the wall, too; 26 % do to who does not look at all sides.
+        assert found["significant_share"] < 0.1
+
+    def test_as_py4dgeo_measures_them(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        # It writes a log where it is imported.
+        monkeypatch.chdir(tmp_path)
         py4dgeo = pytest.importorskip("py4dgeo")
         rng = np.random.default_rng(5)
         reference, points = rng.uniform(-4.0, 4.0, (2, 2500, 3)) * [1.0, 1.0, 0.6]
@@ -93,6 +107,28 @@ class TestDistances:
         np.testing.assert_array_equal(ours.count, other["num_samples2"])
         np.testing.assert_array_equal(theirs.count, other["num_samples1"])
         np.testing.assert_allclose((ours.mean_m - theirs.mean_m)[both], distance[both], atol=1e-9)
+
+    def test_as_py4dgeo_propagates_errors_in_common(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Its scanner, at the origin, errs by angles alone; a cylinder's mean is as uncertain as its points."""
+        monkeypatch.chdir(tmp_path)
+        m3c2ep = pytest.importorskip("py4dgeo.m3c2ep")
+        p = np.random.default_rng(17).uniform([-0.3, -0.3, -80.0], [0.3, 0.3, -79.5], (12, 3)) + np.array(
+            [30.0, 20.0, 0.0]
+        )
+        angle = np.array([[0.0, 0.0, 2e-3, 1e-3]])
+        still, ones = np.eye(3, 4), np.ones(12, np.int64)
+        theirs = m3c2ep.get_local_mean_and_Cxx_nocorr(
+            np.zeros((12, 12)), still, np.zeros((1, 3)), np.zeros(3), angle, p, ones, 0, tf=False
+        )[1]
+        across, ground = np.column_stack([-p[:, 1], p[:, 0], 0.0 * p[:, 0]]), np.hypot(p[:, 0], p[:, 1])
+        down = np.column_stack([p[:, :2] * (p[:, 2] / ground)[:, None], -ground])
+        covariance = 4e-6 * across[:, :, None] * across[:, None, :] + 1e-6 * down[:, :, None] * down[:, None, :]
+        for axis in np.eye(3)[[0, 2]]:
+            found = along_normals(
+                Cloud(p, covariance, shared=True), cKDTree(p), p.mean(axis=0)[None], axis[None], RADIUS_M
+            )
+            assert found.count[0] == 12
+            assert found.variance[0] == pytest.approx(axis @ theirs @ axis, rel=1e-9)
 
 
 class TestLevelOfDetection:

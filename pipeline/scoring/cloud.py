@@ -13,7 +13,7 @@ over small cubes so that places with many points count no more than others. LiDA
 * A return is asked for where frames see it. Several do; it counts once.
 
 Source: Schoeps et al., "A multi-view stereo benchmark with high-resolution images and multi-camera videos" (CVPR 2017),
-section 5, evaluation protocol; the ETH3D multi-view evaluation program, whose cubes are 1 cm.
+where its evaluation is laid down; the ETH3D multi-view evaluation program, whose cubes are 1 cm (--voxel_size).
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ VOXEL_M = 0.2
 
 # A point on a surface has a return within this many distances between returns.
 _CLOSE_SPACINGS = 1.5
+# Returns that say how high and how low a column reaches.
+_IN_COLUMN = 8
 # Two returns nearer than this are one, seen by two frames.
 _SAME_RETURN_M = 1e-3
 
@@ -150,7 +152,7 @@ def _beyond_column(points: Floats, returns: Floats, close: float) -> Bools:
     """Which points are above, or below, all returns around their column."""
     if not len(points):
         return np.zeros(0, np.bool_)
-    distance, rows = (np.asarray(found) for found in cKDTree(returns[:, :2]).query(points[:, :2], k=NEIGHBOURS))
+    distance, rows = (np.asarray(found) for found in cKDTree(returns[:, :2]).query(points[:, :2], k=_IN_COLUMN))
     up = returns[rows, 2]
     out: Bools = (distance[:, 0] <= close) & ((points[:, 2] > up.max(axis=1)) | (points[:, 2] < up.min(axis=1)))
     return out

@@ -1,14 +1,15 @@
 """Distances between two clouds that carry covariances, and which of them are more than the errors explain: M3C2-EP.
 
-At core points spread evenly over the fused cloud, the reference's own surface gives a normal. What of each cloud lies
-in a cylinder about the normal is averaged; the distance is that of the two means along it, positive where the fused
-points lie above. Its variance is propagated from the covariances of the points in the cylinder, so that one point is
-enough and roughness is not mistaken for noise. The distance is one-dimensional, and so is its test: a distance is
-significant when it is more than 1.96 of its sigmas. (With the quantile of three dimensions, which py4dgeo 1.2 takes for
-M3C2-EP, 0.5 % of unchanged distances would be significant, not 5 %.)
+Fused points take part where the returns near them make a surface, which gives a normal. About core points spread evenly
+over them, what of each cloud lies in a cylinder along the normal is averaged; the distance is that of the two means
+along it, positive where the fused points lie above. Its variance is propagated from the covariances of the points in
+the cylinder, so that one point is enough and roughness is not mistaken for noise. The distance is one-dimensional, and
+so is its test: a distance is significant when it is more than 1.96 of its sigmas. (With the quantile of three
+dimensions, which py4dgeo 1.2 takes for M3C2-EP, 0.5 % of unchanged distances would be significant, not 5 %.)
 
 What the errors of neighbouring points have in common does not average away. How they correlate is not kept; where they
-do, the mean of the covariances stands for that of the mean, which no correlation exceeds.
+do, the mean of the covariances stands for that of the mean, which no correlation exceeds (and which py4dgeo takes
+always).
 
 Sources: Lague, Brodu, Leroux, "Accurate 3D comparison of complex topography with terrestrial laser scanner" (ISPRS
 Journal 82, 2013), section 3: core points, cylinders, 1.96 sigmas. Winiwarter, Anders, Hoefle, "M3C2-EP: Pushing the
@@ -28,7 +29,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.scoring.samples import Sample, cells, mixed
-from pipeline.scoring.surface import surface_at
+from pipeline.scoring.surface import NEIGHBOURS, surface_at
 
 CORE_M = 1.0
 """Edge of the cubes that have a core point each."""
@@ -39,8 +40,6 @@ DEPTH_M = 2.0
 QUANTILE_95 = 1.959963984540054
 """Of the normal distribution, two-sided."""
 
-# Normals from twice as many returns as the least a plane needs: some three spacings across.
-_NORMAL_RETURNS = 16
 # A cylinder of this radius holds a dozen returns; no less than so many metres, where returns are dense.
 _RADIUS_SPACINGS, _LEAST_RADIUS_M = 2.0, 0.25
 # The reference's mean is one of at least so many returns.
@@ -62,6 +61,10 @@ class Cloud:
     p_in_enu_m: Floats
     covariance: Floats
     shared: bool
+
+    def where(self, rows: AnyArray) -> Cloud:
+        """Some of the points."""
+        return Cloud(self.p_in_enu_m[rows], self.covariance[rows], self.shared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,15 +123,17 @@ def m3c2_sums(
         translation_covariance: (3, 3) m^2, ENU, of a shift that was found between the two; None for none.
     """
     radius = max(_RADIUS_SPACINGS * spacing_m, _LEAST_RADIUS_M)
-    p, returns = points.p_in_enu_m, reference.p_in_enu_m
-    core = core_points(p)
-    core = core[own[core]]
-    if not len(core) or len(returns) < _NORMAL_RETURNS or not np.isfinite(spacing_m):
+    if len(reference.p_in_enu_m) < NEIGHBOURS or not len(points.p_in_enu_m) or not np.isfinite(spacing_m):
         nothing = np.zeros(0, np.uint64)
         return M3C2Sums((radius, radius), Sample.of(nothing, nothing, np.zeros((0, 2))))
-    tree = cKDTree(returns)
-    surface = surface_at(p[core], returns, tree, spacing_m, _NORMAL_RETURNS)
-    core, normal = core[surface.sound], surface.normal[surface.sound]
+    tree = cKDTree(reference.p_in_enu_m)
+    surface = surface_at(points.p_in_enu_m, reference.p_in_enu_m, tree, spacing_m)
+    # A wall that the reference has no returns on would be averaged with the ground at its foot.
+    points, own, normal = points.where(surface.sound), own[surface.sound], surface.normal[surface.sound]
+    p = points.p_in_enu_m
+    core = core_points(p)
+    core = core[own[core]]
+    normal = normal[core]
     ours = along_normals(points, cKDTree(p), p[core], normal, radius)
     theirs = along_normals(reference, tree, p[core], normal, radius)
     found = np.flatnonzero((ours.count >= 1) & (theirs.count >= _LEAST_RETURNS))

@@ -9,13 +9,14 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.arrays import Bools, Floats
 
-NEIGHBOURS = 8
-"""Returns that a plane is fitted to: three unknowns, and enough over to see that it is no plane."""
+NEIGHBOURS = 16
+"""Returns that a plane is fitted to: enough to see that it is no plane, and on which side of an edge they lie."""
 
 # No return used may be further from the point's foot than this many distances between returns.
-_REACH_SPACINGS = 2.5
-# The returns surround the foot when their mean is not further off than this share of their own spread.
-_OFF_CENTRE = 0.75
+_REACH_SPACINGS = 3.5
+# The returns surround the foot when their mean is not further off than this share of their own spread: all around it
+# they are 0.25 off by chance, on one side of an edge 0.75.
+_OFF_CENTRE = 0.5
 # Returns nearly in one line fix no plane.
 _LEAST_ROUNDNESS = 0.02
 # Spread about the plane beyond which it is none: a share of the returns' lesser extent, but no less than LiDAR's noise.
@@ -44,34 +45,29 @@ class Surface:
         return np.where(self.sound, np.abs(self.signed_m), self.nearest_m)
 
 
-def surface_at(
-    points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree, spacing_m: float, neighbours: int = NEIGHBOURS
-) -> Surface:
+def surface_at(points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree, spacing_m: float) -> Surface:
     """The surface near points.
 
     Args:
         points_in_enu_m: (n, 3) ENU, m.
-        returns_in_enu_m: (m, 3) ENU, m; m >= neighbours.
+        returns_in_enu_m: (m, 3) ENU, m; m >= `NEIGHBOURS`.
         tree: Of the returns.
         spacing_m: Between neighbouring returns, m.
-        neighbours: Returns that a plane is fitted to.
     """
-    distance, rows = (np.asarray(found) for found in tree.query(points_in_enu_m, k=neighbours))
+    distance, rows = (np.asarray(found) for found in tree.query(points_in_enu_m, k=NEIGHBOURS))
     near = returns_in_enu_m[rows]
     centre = near.mean(axis=1)
     centred = near - centre[:, None, :]
-    value, vector = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred) / neighbours)
+    value, vector = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred) / NEIGHBOURS)
     normal = vector[:, :, 0] * np.where(vector[:, 2, 0] < 0.0, -1.0, 1.0)[:, None]
     offset = points_in_enu_m - centre
     signed = np.einsum("ni,ni->n", offset, normal)
     aside = offset - signed[:, None] * normal
     foot = centre + aside
     extent = value[:, 1] + value[:, 2]
-    spread = np.sqrt(np.maximum(value[:, 0], 0.0) * neighbours / (neighbours - 3))
-    # A disc of so many more returns is so much wider.
-    reach = _REACH_SPACINGS * spacing_m * np.sqrt(neighbours / NEIGHBOURS)
+    spread = np.sqrt(np.maximum(value[:, 0], 0.0) * NEIGHBOURS / (NEIGHBOURS - 3))
     sound: Bools = spread <= np.maximum(_LARGEST_SPREAD * np.sqrt(np.maximum(value[:, 1], 0.0)), _NOISE_M)
     sound &= value[:, 1] * value[:, 2] > (_LEAST_ROUNDNESS * extent) ** 2
     sound &= np.einsum("ni,ni->n", aside, aside) <= _OFF_CENTRE**2 * extent
-    sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= reach
+    sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= _REACH_SPACINGS * spacing_m
     return Surface(distance[:, 0], signed, normal, sound)

@@ -31,10 +31,10 @@ PIXELS = {
     "a5": (29, 21, DOWN, 25, 40, (20, 24, 40), (1, 0, 0)),
     "a6": (45, 45, DOWN, 64, NAN, (NAN, 72, 32), (NAN, 0, 0)),
     "b7": (-0.5, -0.5, NORTH_DOWN, 10, 5, (8, 12, 15), (4, 3, 0)),
-    "b8": (79.5, 59.5, DOWN, 20, 0.75, (32, 20, 30), (6, 0, 8)),
+    "b8": (79.5, 2, DOWN, 20, 0.75, (32, 20, 30), (6, 0, 8)),
     "b9": (33, 33, NORTH_DOWN, 40, 9, (30, 36, 80), (24, 7, 60)),
     "b10": (33, 34, NORTH, 50, 0.6, (110, 40, NAN), (NAN, 1, 1)),
-    "b11": (50, 10, EAST_DOWN, 16, 0, (17, 32, 24), (1, 0, 0)),
+    "b11": (3, 12, EAST_DOWN, 16, 0, (17, 32, 24), (1, 0, 0)),
 }
 MASKED = {"epi": {"a5", "a6", "b11"}, "dlt": {"a3"}, "mono": {"a1", "b10"}}
 COMMON = ("a0", "a2", "a4", "b7", "b8", "b9")
@@ -172,8 +172,8 @@ def test_the_published_method_in_closed_form(found: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("method", "kept", "kept_a", "kept_b", "covered"),
     [
-        # Frame a has pixels in the cells (0, 0) two, (1, 0), (7, 5), (2, 2) two and (4, 4); b in (0, 0), (7, 5), (3, 3)
-        # two and (5, 1): nine cells. epi lacks a's (4, 4) and b's (5, 1), dlt a's (7, 5), mono none.
+        # Frame a has pixels in the cells (0, 0) two, (1, 0), (7, 5), (2, 2) two and (4, 4); b in (0, 0), (7, 0), (3, 3)
+        # two and (0, 1): nine cells. epi lacks a's (4, 4) and b's (0, 1), dlt a's (7, 5), mono none.
         ("epi", F(9, 12), F(5, 7), F(4, 5), F(7, 9)),
         ("dlt", F(11, 12), F(6, 7), F(5, 5), F(8, 9)),
         ("mono", F(10, 12), F(6, 7), F(4, 5), F(9, 9)),

@@ -56,7 +56,8 @@ class BinnedSums:
         count = len(edges) - 1
         place = np.searchsorted(edges, quantity, side="right") - 1
         place[quantity == edges[-1]] = count - 1
-        place[(place >= count) | np.isnan(quantity)] = -1
+        # NaN is sorted behind the last edge.
+        place[place >= count] = -1
         sums = (GroupedSums.of(depth_m[of], reference_m[of], place[of], count) for of in (kept, common))
         return BinnedSums(edges, *sums)
 

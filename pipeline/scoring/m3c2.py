@@ -2,10 +2,12 @@
 
 Fused points take part where the returns near them make a surface, which gives a normal. About core points spread evenly
 over them, what of each cloud lies in a cylinder along the normal is averaged; the distance is that of the two means
-along it, positive where the fused points lie above. Its variance is propagated from the covariances of the points in
-the cylinder, so that one point is enough and roughness is not mistaken for noise. The distance is one-dimensional, and
-so is its test: a distance is significant when it is more than 1.96 of its sigmas. (With the quantile of three
-dimensions, which py4dgeo 1.2 takes for M3C2-EP, 0.5 % of unchanged distances would be significant, not 5 %.)
+along it, positive where the fused points lie above. Where the returns in the cylinder are no plane, there is none.
+
+The variance is propagated from the covariances of the points in the cylinder, so that one point is enough and roughness
+is not mistaken for noise. The distance is one-dimensional, and so is its test: a distance is significant when it is
+more than 1.96 of its sigmas. (With the quantile of three dimensions, which py4dgeo 1.2 takes for M3C2-EP, 0.5 % of
+unchanged distances would be significant, not 5 %.)
 
 What the errors of neighbouring points have in common does not average away. How they correlate is not kept; where they
 do, the mean of the covariances stands for that of the mean, which no correlation exceeds (and which py4dgeo takes
@@ -29,7 +31,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
 from pipeline.scoring.samples import Sample, cells, mixed
-from pipeline.scoring.surface import NEIGHBOURS, surface_at
+from pipeline.scoring.surface import NEIGHBOURS, flat, surface_at
 
 CORE_M = 1.0
 """Edge of the cubes that have a core point each."""
@@ -136,7 +138,9 @@ def m3c2_sums(
     normal = normal[core]
     ours = along_normals(points, cKDTree(p), p[core], normal, radius)
     theirs = along_normals(reference, tree, p[core], normal, radius)
-    found = np.flatnonzero((ours.count >= 1) & (theirs.count >= _LEAST_RETURNS))
+    # The root mean square of a disc along one of its diameters is half its radius.
+    one_surface = flat(theirs.spread_m, np.full(len(core), radius / 2.0))
+    found = np.flatnonzero((ours.count >= 1) & (theirs.count >= _LEAST_RETURNS) & one_surface)
     variance = ours.variance + theirs.variance
     if translation_covariance is not None:
         variance = variance + np.einsum("ni,ij,nj->n", normal, translation_covariance, normal)
@@ -170,11 +174,13 @@ class Means:
         count: (c,) points.
         mean_m: (c,) their mean along the normal, from the core point, m; 0 where there is none.
         variance: (c,) of that mean, m^2.
+        spread_m: (c,) of the points about it, m.
     """
 
     count: Ints
     mean_m: Floats
     variance: Floats
+    spread_m: Floats
 
 
 def along_normals(cloud: Cloud, tree: cKDTree, core_in_enu_m: Floats, normal: Floats, radius_m: float) -> Means:
@@ -188,15 +194,18 @@ def along_normals(cloud: Cloud, tree: cKDTree, core_in_enu_m: Floats, normal: Fl
         radius_m: Their radius, m.
     """
     count = np.zeros(len(core_in_enu_m), np.int64)
-    mean, variance = np.zeros(len(core_in_enu_m)), np.zeros(len(core_in_enu_m))
+    mean, square, variance = (np.zeros(len(core_in_enu_m)) for _ in range(3))
     for cylinder, point, along in _members(cloud.p_in_enu_m, tree, core_in_enu_m, normal, radius_m):
         axis = normal[cylinder]
         own = np.einsum("ni,nij,nj->n", axis, cloud.covariance[point], axis)
         count += np.bincount(cylinder, minlength=len(count))
         mean += np.bincount(cylinder, along, minlength=len(count))
+        square += np.bincount(cylinder, along**2, minlength=len(count))
         variance += np.bincount(cylinder, own, minlength=len(count))
     some = np.maximum(count, 1)
-    return Means(count, mean / some, variance / (some if cloud.shared else some**2))
+    mean = mean / some
+    spread = np.sqrt(np.maximum(square / some - mean**2, 0.0))
+    return Means(count, mean, variance / (some if cloud.shared else some**2), spread)
 
 
 def _members(

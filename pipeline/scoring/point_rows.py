@@ -141,31 +141,26 @@ def _rows(path: Path, lower: Floats, upper: Floats) -> pa.Table:
 
 def _points(table: pa.Table, transform: FrameTransform) -> tuple[Floats, Floats, AnyArray]:
     p = transform.enu_from(coordinates(table))
-    sigma_x, sigma_y, sigma_z, xy, xz, yz = (
-        np.asarray(table.column(name).to_numpy(), np.float64) for name in _COVARIANCE
-    )
-    return p, covariance_in_enu((sigma_x, sigma_y, sigma_z), (xy, xz, yz), p, transform), _names(table)
+    sx, sy, sz, xy, xz, yz = (np.asarray(table.column(name).to_numpy(), np.float64) for name in _COVARIANCE)
+    rows = (sx**2, xy, xz, xy, sy**2, yz, xz, yz, sz**2)
+    covariance = np.stack(rows, axis=-1).reshape(-1, 3, 3)
+    return p, covariance_in_enu(covariance, p, transform), _names(table)
 
 
-def covariance_in_enu(
-    sigmas: Sequence[Floats], covariances: Sequence[Floats], p_in_enu_m: Floats, transform: FrameTransform
-) -> Floats:
-    """Covariances on the axes of a CRS, as the points' columns have them, on those of the local frame.
+def covariance_in_enu(covariance: Floats, p_in_enu_m: Floats, transform: FrameTransform) -> Floats:
+    """Covariances on the axes of a CRS, as points and tiles have them, on those of the local frame.
 
     Args:
-        sigmas: (n,) each, of x, y and z, m.
-        covariances: (n,) each, of x and y, x and z, y and z, m^2.
+        covariance: (n, 3, 3) on the CRS's axes.
         p_in_enu_m: (n, 3) where the points are, ENU m; n >= 1.
         transform: The way to the CRS.
 
     Returns:
         (n, 3, 3) m^2, ENU.
     """
-    (x, y, z), (xy, xz, yz) = (sigma**2 for sigma in sigmas), covariances
-    in_crs = np.stack([x, xy, xz, xy, y, yz, xz, yz, z], axis=-1).reshape(-1, 3, 3)
-    # One for all of them, as when they were written: it changes by 1e-4 over a kilometre.
+    # One for all of them: it changes by 1e-4 over a kilometre.
     enu_from_crs = np.linalg.inv(transform.jacobian(p_in_enu_m.mean(axis=0)))
-    out: Floats = enu_from_crs @ in_crs @ enu_from_crs.T
+    out: Floats = enu_from_crs @ covariance @ enu_from_crs.T
     return out
 
 

@@ -21,6 +21,8 @@ _OFF_CENTRE = 0.5
 _LEAST_ROUNDNESS = 0.02
 # Spread about the plane beyond which it is none: a share of the returns' lesser extent, but no less than LiDAR's noise.
 _LARGEST_SPREAD, _NOISE_M = 0.15, 0.05
+# To a point that lies off the plane, a return further along it may be the nearer one by so many sigmas of its noise.
+_FAR_NOISES = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +68,20 @@ def surface_at(points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree,
     foot = centre + aside
     extent = value[:, 1] + value[:, 2]
     spread = np.sqrt(np.maximum(value[:, 0], 0.0) * NEIGHBOURS / (NEIGHBOURS - 3))
-    sound: Bools = spread <= np.maximum(_LARGEST_SPREAD * np.sqrt(np.maximum(value[:, 1], 0.0)), _NOISE_M)
+    reach = np.sqrt((_REACH_SPACINGS * spacing_m) ** 2 + 2.0 * np.abs(signed) * _FAR_NOISES * spread)
+    sound: Bools = flat(spread, np.sqrt(np.maximum(value[:, 1], 0.0)))
     sound &= value[:, 1] * value[:, 2] > (_LEAST_ROUNDNESS * extent) ** 2
     sound &= np.einsum("ni,ni->n", aside, aside) <= _OFF_CENTRE**2 * extent
-    sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= _REACH_SPACINGS * spacing_m
+    sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= reach
     return Surface(distance[:, 0], signed, normal, sound)
+
+
+def flat(spread_m: Floats, extent_m: Floats) -> Bools:
+    """Whether returns with such a spread about their plane make a plane.
+
+    Args:
+        spread_m: (n,) root mean square of their distances from it, m.
+        extent_m: (n,) root mean square of how far they reach along it, in the direction where they reach least, m.
+    """
+    out: Bools = spread_m <= np.maximum(_LARGEST_SPREAD * extent_m, _NOISE_M)
+    return out

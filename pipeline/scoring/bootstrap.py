@@ -27,7 +27,7 @@ def intervals(clusters: GroupedSums) -> Floats | None:
 
     Pixels of one cluster share an error (a frame's pose, a neighbourhood's match), so whole clusters are drawn, with
     replacement, as many as there are. A draw's metrics follow from how often each cluster is in it and from the
-    clusters' sums.
+    clusters' sums. What all clusters have in common - of frames, a shift of the whole flight - is not in the interval.
 
     Args:
         clusters: Their sums; those without a pixel do not take part.

@@ -23,6 +23,8 @@ _LEAST_ROUNDNESS = 0.02
 _LARGEST_SPREAD, _NOISE_M = 0.15, 0.05
 # To a point that lies off the plane, a return further along it may be the nearer one by so many sigmas of its noise.
 _FAR_NOISES = 4.0
+# Points whose neighbours are held at once: 20 MB.
+_BLOCK = 50_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +58,21 @@ def surface_at(points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree,
         tree: Of the returns.
         spacing_m: Between neighbouring returns, m.
     """
-    distance, rows = (np.asarray(found) for found in tree.query(points_in_enu_m, k=NEIGHBOURS))
-    near = returns_in_enu_m[rows]
+    blocks = [
+        _block(points_in_enu_m[first : first + _BLOCK], returns_in_enu_m, tree, spacing_m)
+        for first in range(0, max(len(points_in_enu_m), 1), _BLOCK)
+    ]
+    return Surface(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+
+
+def _block(points: Floats, returns: Floats, tree: cKDTree, spacing_m: float) -> tuple[Floats, Floats, Floats, Bools]:
+    distance, rows = (np.asarray(found) for found in tree.query(points, k=NEIGHBOURS))
+    near = returns[rows]
     centre = near.mean(axis=1)
     centred = near - centre[:, None, :]
     value, vector = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred) / NEIGHBOURS)
     normal = vector[:, :, 0] * np.where(vector[:, 2, 0] < 0.0, -1.0, 1.0)[:, None]
-    offset = points_in_enu_m - centre
+    offset = points - centre
     signed = np.einsum("ni,ni->n", offset, normal)
     aside = offset - signed[:, None] * normal
     foot = centre + aside
@@ -73,7 +83,7 @@ def surface_at(points_in_enu_m: Floats, returns_in_enu_m: Floats, tree: cKDTree,
     sound &= value[:, 1] * value[:, 2] > (_LEAST_ROUNDNESS * extent) ** 2
     sound &= np.einsum("ni,ni->n", aside, aside) <= _OFF_CENTRE**2 * extent
     sound &= np.linalg.norm(near - foot[:, None, :], axis=2).max(axis=1) <= reach
-    return Surface(distance[:, 0], signed, normal, sound)
+    return distance[:, 0], signed, normal, sound
 
 
 def flat(spread_m: Floats, extent_m: Floats) -> Bools:

@@ -81,7 +81,7 @@ def _cameras(run: RunData, ground: Ground, shown: ShownPoints, corner: Floats) -
     names = evenly(np.array(list(placed), object), MOST_FRAMES).tolist()
     centres = np.array([placed[name].centre for name in names])
     span = np.ptp(np.concatenate([shown.xyz, ground.place(centres)])[:, :2], axis=0).max()
-    lines = [_pyramid(placed[name], cameras[name], _PYRAMID_SHARE * float(span)) for name in names]
+    lines = [pyramid(placed[name], cameras[name], _PYRAMID_SHARE * float(span)) for name in names]
     at = np.round(ground.place(np.concatenate(lines)) - corner, 2)
     return {
         "type": "scatter3d",
@@ -97,7 +97,7 @@ def _cameras(run: RunData, ground: Ground, shown: ShownPoints, corner: Floats) -
     }
 
 
-def _pyramid(placed: Placement, camera: Camera, height_m: float) -> Floats:
+def pyramid(placed: Placement, camera: Camera, height_m: float) -> Floats:
     """A line along the edges of a camera's pyramid of sight, (11, 3) m, ENU; its last point is a gap."""
     right, bottom = camera.width / 2.0 / camera.fx, camera.height / 2.0 / camera.fy
     corners = np.array([[-right, -bottom, 1.0], [right, -bottom, 1.0], [right, bottom, 1.0], [-right, bottom, 1.0]])
@@ -121,7 +121,7 @@ def _layout(colours: PointColours) -> dict[str, Any]:
             "xaxis": {"title": {"text": "east (m)"}},
             "yaxis": {"title": {"text": "north (m)"}},
             "zaxis": {"title": {"text": "height (m)"}},
-            "camera": {"eye": {"x": -0.9, "y": -1.7, "z": 1.1}, "center": {"x": 0.0, "y": 0.0, "z": -0.2}},
+            "camera": {"eye": {"x": -1.0, "y": -1.9, "z": 1.25}, "center": {"x": 0.0, "y": 0.0, "z": -0.2}},
         },
         "updatemenus": [colours.menu(0)],
         "margin": {"l": 0, "r": 0, "t": 44, "b": 0},

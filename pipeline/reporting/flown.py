@@ -47,14 +47,15 @@ def figures(run: RunData) -> list[Figure]:
         *([] if colours is None else [_points(shown, colours)]),
         *_pairs(run, ground),
         *_frames(run, ground, shown),
+        *_surveyed(run, ground),
     ]
-    of_points = f" {len(shown):,} of {points.rows:,} points, spread evenly;" if points is not None else ""
+    of_points = "" if points is None else f" {len(shown):,} of {points.rows:,} points, spread evenly."
     return [
         Figure(
             "map",
             "Frames, pairs and points",
-            f"Each frame with a line towards what it looks at, and lines between the frames of a pair.{of_points} a "
-            "click in the legend shows or hides a kind.",
+            "Each frame with a line towards what it looks at, and lines between the frames of a pair."
+            f"{of_points} A click in the legend hides a kind or shows it again.",
             tuple(traces),
             _layout(ground, colours),
             620,
@@ -138,6 +139,36 @@ def _frames(run: RunData, ground: Ground, shown: ShownPoints) -> list[dict[str, 
             "one sigma: %{customdata[1]:.3f} m level, %{customdata[2]:.3f} m up<extra></extra>",
         },
     ]
+
+
+def _surveyed(run: RunData, ground: Ground) -> list[dict[str, Any]]:
+    """Control points and checkpoints whose place the scores tell."""
+    metrics = run.metrics or {}
+    control = (metrics.get("control_points") or {}).get("by_point", {})
+    checked = (metrics.get("checkpoints") or {}).get("points", [])
+    kinds = (
+        ("control points", "triangle-up", {name: one.get("position_m") for name, one in control.items()}),
+        ("checkpoints", "diamond", {one["name"]: one.get("position_m") for one in checked}),
+    )
+    found = []
+    for kind, symbol, places in kinds:
+        known = {name: place for name, place in places.items() if place is not None}
+        if not known:
+            continue
+        at = ground.place(np.array(list(known.values()), np.float64))
+        found.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": kind,
+                "x": typed(np.round(at[:, 0], 2)),
+                "y": typed(np.round(at[:, 1], 2)),
+                "text": list(known),
+                "marker": {"size": 10, "symbol": symbol, "color": _MARKS, "line": {"width": 1, "color": "#ffffff"}},
+                "hovertemplate": "<b>%{text}</b><extra>" + kind + "</extra>",
+            }
+        )
+    return found
 
 
 def _layout(ground: Ground, colours: PointColours | None) -> dict[str, Any]:

@@ -230,12 +230,12 @@ def _error_limit(judged: Sequence[_Dots]) -> float:
         return 1.0
     wanted = max(float(np.percentile(errors, _ERROR_SHARE)), 1e-3)
     decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(decade * next(step for step in (1.0, 2.0, 3.0, 5.0, 10.0) if step * decade >= wanted))
+    return float(decade * next(step for step in (1.0, 2.0, 3.0, 5.0, 10.0) if step * decade >= wanted * (1.0 - 1e-9)))
 
 
 def _photo_panel(sheet: _Sheet, photo: Bytes | None) -> Figure:
     if photo is None:
-        return _panel(sheet, "photo", "Photo", "Not found where it was.", sheet.ground)
+        return _panel(sheet, "photo", "Photo", "Not found where it was; plain grey instead.", sheet.ground)
     return _panel(sheet, "photo", "Photo", f"{sheet.frame_id} as taken.", photo)
 
 

@@ -58,11 +58,18 @@ def painted(ground: Bytes, full: tuple[int, int], pixels: Floats, colours: Bytes
     out = ground.copy()
     height, width = ground.shape[:2]
     places = np.round((pixels + 0.5) * (np.array([width, height]) / np.array(full)) - 0.5).astype(np.int64)
-    for across, down in _dot(_radius_px(height * width, len(np.unique(places, axis=0)))):
-        at = places + np.array([across, down])
-        inside = ((at >= 0) & (at < (width, height))).all(axis=1)
-        out[at[inside, 1], at[inside, 0]] = colours[inside]
+    flat = out.reshape(-1, 3)
+    for across, down in _dot(_radius_px(height * width, _distinct(places, width))):
+        u, v = places[:, 0] + across, places[:, 1] + down
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        flat[v[inside] * width + u[inside]] = colours[inside]
     return out
+
+
+def _distinct(places: AnyArray, width: int) -> int:
+    """How many pixels of the picture some places are in."""
+    flat = places[:, 1] * width + places[:, 0]
+    return int(np.count_nonzero(np.bincount(flat - flat.min()))) if len(flat) else 0
 
 
 def _radius_px(area: int, dots: int) -> int:

@@ -22,9 +22,10 @@ from hypothesis.extra import numpy as hnp
 from pyproj import CRS, Transformer
 
 from pipeline.engine.runfolder import RunFolder
-from pipeline.flight import column, columns, placements_of
+from pipeline.flight import column, columns
 from pipeline.geometry.arrays import AnyArray, Bytes, Floats
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.poses import Placement
 from pipeline.points.geoparquet import PointDataset, tile_table, write_dataset
 from pipeline.reporting import cloud_view, error_plots, flown, overlays
 from pipeline.reporting.error_sums import ErrorSums, Plan, error_sums
@@ -236,6 +237,16 @@ def test_thinning_is_bounded_even_and_the_same_however_the_points_are_stored(tmp
     assert all(tuple(point) in stored for point in shown.xyz)
 
 
+def test_a_grid_that_is_coarsened_does_not_tell_pieces_apart(tmp_path: Path) -> None:
+    xyz = np.random.default_rng(5).uniform((0.0, 0.0, 0.0), (100.0, 80.0, 20.0), (12_000, 3))
+    shown = thinned(cloud(tmp_path / "whole", xyz, 1), 300)
+    assert 120 < len(shown) <= 300
+    np.testing.assert_array_equal(shown.xyz, thinned(cloud(tmp_path / "parts", xyz, 5), 300).xyz)
+    # Each fifth of the volume has its share.
+    shares = np.histogram(shown.xyz[:, 0], 5, (0.0, 100.0))[0] / len(shown)
+    assert shares.min() > 0.1
+
+
 def test_few_points_are_all_shown(tmp_path: Path) -> None:
     xyz = np.random.default_rng(3).uniform(0.0, 9.0, (300, 3))
     assert len(thinned(cloud(tmp_path / "few", xyz, 2), 300)) == 300
@@ -332,19 +343,14 @@ def test_the_buttons_of_the_cloud_recolour_its_points(run: RunData) -> None:
 
 
 def test_a_camera_s_pyramid_opens_towards_what_it_sees() -> None:
-    placed = next(iter(placements_of(_poses_looking_down()).values()))
+    # Level, to the east: right is south, down the image is down.
+    turn = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    placed = Placement(turn, np.array([1.0, 2.0, 10.0]))
     line = cloud_view.pyramid(placed, Camera("pinhole", 400, 200, 100.0, 100.0, 199.5, 99.5), 2.0)
     assert np.isnan(line[-1]).all()
-    corners = np.unique(line[1:-1][line[1:-1, 2] < 9.0], axis=0)
-    np.testing.assert_allclose(line[0], [1.0, 2.0, 10.0])
-    np.testing.assert_allclose(corners, [[-3, 0, 8], [-3, 4, 8], [5, 0, 8], [5, 4, 8]], atol=1e-12)
-
-
-def _poses_looking_down() -> pa.Table:
-    # Right is east, down the image is south, forward is down.
-    turn = {"qw": 0.0, "qx": 1.0, "qy": 0.0, "qz": 0.0}
-    row = {"frame_id": "a", "east_m": 1.0, "north_m": 2.0, "up_m": 10.0, **turn}
-    return pa.table({name: [value] for name, value in row.items()})
+    np.testing.assert_allclose(line[0], placed.centre)
+    corners = np.unique(line[1:-1][line[1:-1, 0] > 1.5], axis=0)
+    np.testing.assert_allclose(corners, [[3, -2, 8], [3, -2, 12], [3, 6, 8], [3, 6, 12]], atol=1e-12)
 
 
 # Pictures

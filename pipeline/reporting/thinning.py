@@ -15,6 +15,8 @@ from pipeline.points.geoparquet import PointDataset
 _XYZ, _SIGMAS, _RGB = ("x", "y", "z"), ("sigma_x_m", "sigma_y_m", "sigma_z_m"), ("red", "green", "blue")
 # Cells to begin with, per point that is asked for: so fine that few points are lost to the first grid.
 _FINENESS = 16.0
+# Cells along an axis: three such numbers fit into 63 bits.
+_MOST_CELLS = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +72,7 @@ def thinned(points: PointDataset, limit: int) -> ShownPoints:
     """
     low, high = np.array(points.bounds[:3]), np.array(points.bounds[3:])
     size = np.maximum(high - low, 1e-3)
-    edge = float(np.sqrt(size[0] * size[1] / (_FINENESS * limit)))
+    edge = max(float(np.sqrt(size[0] * size[1] / (_FINENESS * limit))), float(size.max()) / _MOST_CELLS)
     kept, step = ShownPoints.none(), 0
     for path in points.files:
         with explained(path, "points"):
@@ -89,6 +91,7 @@ def _first_of_cells(xyz: Floats, edge: float, step: int) -> Ints:
     """The rows that are the first of their cell; each step doubles the cells along the next axis."""
     doublings = np.array([(step + 2) // 3, (step + 1) // 3, step // 3])
     cells = np.floor(xyz / edge).astype(np.int64) >> doublings
-    _, first = np.unique(cells, axis=0, return_index=True)
+    # One number per cell, three times as fast to sort as three.
+    _, first = np.unique(cells @ np.array([1, _MOST_CELLS << 1, (_MOST_CELLS << 1) ** 2]), return_index=True)
     out: Ints = np.sort(first)
     return out

@@ -31,7 +31,7 @@ def typed(values: AnyArray) -> dict[str, str]:
     Source: plotly.js, "typed array specification" (dtype, bdata, shape).
     """
     name = _TYPES[values.dtype]
-    little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    little = values.astype(values.dtype.newbyteorder("<"))
     found = {"dtype": name, "bdata": base64.b64encode(little.tobytes()).decode("ascii")}
     return found if values.ndim == 1 else found | {"shape": ", ".join(map(str, values.shape))}
 

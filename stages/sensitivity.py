@@ -29,7 +29,7 @@ from pipeline.scoring.summary import to_json
 from pipeline.sensitivity.curves import curve_rows, sentence, withstood
 from pipeline.sensitivity.injected import ACROSS, ALONG, UP, Injection, injections
 from pipeline.sensitivity.pair_errors import Ways
-from pipeline.sensitivity.references import Reference
+from pipeline.sensitivity.references import OWN, Reference, scored_elsewhere
 from pipeline.sensitivity.takes import Take, takes_of
 from pipeline.sensitivity.trial import Trial
 from schemas import CURVES
@@ -58,7 +58,7 @@ class Config(StageConfig):
     yaw_deg: _Errors = Field(_TURNS_DEG, description="Errors of src's yaw; symmetric about 0 (deg)")
     pitch_deg: _Errors = Field(_TURNS_DEG, description="Errors of src's pitch; symmetric about 0 (deg)")
     roll_deg: _Errors = Field(_TURNS_DEG, description="Errors of src's roll; symmetric about 0 (deg)")
-    max_pairs_per_take: int = Field(10, ge=1, description="Pairs of each take that are looked at, evenly chosen (1)")
+    max_pairs_per_take: int = Field(6, ge=1, description="Pairs of each take that are looked at, evenly chosen (1)")
     max_range_m: float | None = Field(
         None,
         gt=0.0,
@@ -75,7 +75,9 @@ class Config(StageConfig):
 def run(config: Config, context: Context) -> str:
     """Tries errors on some pairs of each take; writes `sensitivity/curves.parquet` and `sensitivity.json`."""
     ways = _ways(config, context)
-    reference = Reference.of(context.path("scores") / "pixels.parquet", context.path("depths"), ways.methods[0])
+    reference = Reference.of(context.path("scores"), context.path("depths"), ways.methods[0])
+    if reference.kind == OWN and scored_elsewhere(context.path("scores")):
+        context.warn("score compared pixels that are not those of the matches (dense); the run is its own reference")
     takes = _takes(context, reference)
     chosen = [take.sampled(config.max_pairs_per_take) for take in takes]
     values = config.values()

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from flights import copied, epitransfer
@@ -15,6 +17,7 @@ from pydantic import ValidationError
 from refinement_scenes import NONE, OWN, Errors, logged, matched, matches_of, named, placement, seen_points, straight
 
 from pipeline.depthing import Limits, MatchedRays
+from pipeline.engine.errors import InputError
 from pipeline.flight import PairRow
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
@@ -25,7 +28,7 @@ from pipeline.refinement.matched import Matched
 from pipeline.sensitivity.curves import curve_rows, withstood
 from pipeline.sensitivity.injected import ACROSS, ALONG, UNITS, UP, Injection, injections, with_error
 from pipeline.sensitivity.pair_errors import PairErrors, PosedPair, Ways, depths, epipole_inside, pair_errors
-from pipeline.sensitivity.references import LIDAR
+from pipeline.sensitivity.references import LIDAR, Reference
 from pipeline.sensitivity.references import OWN as OWN_DEPTHS
 from pipeline.sensitivity.takes import spread, takes_of
 from schemas import CURVES
@@ -313,7 +316,7 @@ def test_spread(count: int, most: int, rows: list[int]) -> None:
 FEW = (
     "--set", "sensitivity.translation_m=[-0.5,0,0.5]", "--set", "sensitivity.yaw_deg=[-1,0,1]",
     "--set", "sensitivity.pitch_deg=[-1,0,1]", "--set", "sensitivity.roll_deg=[-1,0,1]",
-    "--set", "sensitivity.max_pairs_per_take=3",
+    "--set", "sensitivity.max_pairs_per_take=2",
 )  # fmt: skip
 
 
@@ -337,7 +340,7 @@ def test_the_stage_beside_scores(small_run: Path, tmp_path: Path) -> None:
     found = told(run)
     assert found["reference"] == LIDAR
     first, second = found["takes"]
-    assert first["n_pairs_tried"] == 3 < first["n_pairs"]
+    assert first["n_pairs_tried"] == 2 < first["n_pairs"]
     assert second["n_pairs_tried"] == second["n_pairs"] == 1
     # Six kinds, three errors, four methods, with and without refinement.
     assert [row["kind"] for row in found["curves"][::24]] == [*UNITS, *UNITS]
@@ -379,6 +382,37 @@ def test_without_scores_the_run_is_its_own_reference(small_run: Path, tmp_path: 
     # Poses and sigmas are as logged in this mode, so that no error is the run itself.
     assert all(row["abs_rel"] < 1e-9 and row["kept_share"] == 1.0 for row in rows if row["injected"] == 0.0)
     assert all(row["abs_rel"] > 1e-3 for row in rows if row["injected"] and row["kind"] in {ALONG, "pitch", "roll"})
+
+
+@pytest.mark.parametrize(
+    ("metrics", "kind"),
+    [
+        ({"truth": {"correspondence": "sparse"}}, LIDAR),
+        # As scores were before they told.
+        ({}, LIDAR),
+        ({"truth": {"correspondence": "dense"}}, OWN_DEPTHS),
+    ],
+)
+def test_scores_at_other_pixels_are_no_reference(metrics: dict[str, Any], kind: str, tmp_path: Path) -> None:
+    (tmp_path / "pixels.parquet").touch()
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    assert Reference.of(tmp_path, tmp_path / "depths", "dlt").kind == kind
+
+
+def test_damaged_scores_are_told(tmp_path: Path) -> None:
+    (tmp_path / "pixels.parquet").touch()
+    (tmp_path / "metrics.json").write_text('{"truth": {"corr')
+    with pytest.raises(InputError, match=r"E-SENS-02(.|\n)*metrics\.json"):
+        Reference.of(tmp_path, tmp_path / "depths", "dlt")
+
+
+def test_references_are_found_by_their_pixels(tmp_path: Path) -> None:
+    reference = Reference(LIDAR, tmp_path, "pixels", "reference_m", pc.scalar(True))
+    rows = pa.table({"u": [5.0, 1.0, 1.0, 7.25], "v": [2.0, 9.0, 3.0, 0.0], "reference_m": [1.0, 2.0, 3.0, 4.0]})
+    wanted = np.array([[1.0, 3.0], [7.25, 0.0], [1.0, 4.0], [5.0, 2.0], [9.0, 9.0], [0.0, 0.0], [1.0, 9.0]])
+    found = reference.at(rows, wanted)
+    assert np.array_equal(found, [3.0, 4.0, np.nan, 1.0, np.nan, np.nan, 2.0], equal_nan=True)
+    assert np.isnan(reference.at(rows.slice(0, 0), wanted)).all()
 
 
 def test_a_run_does_it_only_where_asked(small_run: Path) -> None:

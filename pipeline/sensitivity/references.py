@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from pipeline.engine.errors import InputError
 from pipeline.engine.tables import dataset, explained
 from pipeline.flight import column, columns
 from pipeline.geometry.arrays import Floats
@@ -36,16 +38,16 @@ class Reference:
     where: pc.Expression
 
     @classmethod
-    def of(cls, pixels: Path, depths: Path, method: str) -> Reference:
-        """The scored pixels where there are any at matches, else the depths that a method keeps.
+    def of(cls, scores: Path, depths: Path, method: str) -> Reference:
+        """The scored pixels where they are those of the matches, else the depths that a method keeps.
 
         Args:
-            pixels: The file `scores/pixels.parquet`, which need not exist.
+            scores: The folder `scores`, which need not exist.
             depths: The dataset `depths`.
             method: The published one.
         """
-        own = pc.field("method") == method
-        if pixels.exists():
+        own, pixels = pc.field("method") == method, scores / "pixels.parquet"
+        if pixels.exists() and not scored_elsewhere(scores):
             return cls(LIDAR, pixels, "pixels", "reference_m", own)
         return cls(OWN, depths, "depths", "depth_m", own & pc.field("kept"))
 
@@ -76,3 +78,21 @@ class Reference:
         order = np.argsort(known, kind="stable")
         place = order[np.minimum(np.searchsorted(known, wanted, sorter=order), len(known) - 1)]
         return np.where(known[place] == wanted, np.asarray(column(rows, self.value), np.float64)[place], np.nan)
+
+
+def scored_elsewhere(scores: Path) -> bool:
+    """Whether the pixels in a folder `scores` are those of the truth, dense, and not those of the matches.
+
+    Raises:
+        InputError: Its metrics.json is damaged.
+    """
+    path = scores / "metrics.json"
+    if not path.exists():
+        return False
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(
+            "E-SENS-02", "the scores cannot be read", where=str(path), found=str(error), hint="rerun score"
+        ) from error
+    return bool(found.get("truth", {}).get("correspondence") == "dense")

@@ -21,7 +21,7 @@ from pipeline.sensitivity.pair_errors import PairErrors, PosedPair, Ways, pair_e
 from pipeline.sensitivity.references import Reference
 from pipeline.sensitivity.takes import spread
 
-# A take of ten such pairs has ten thousand: its mean is known to a hundredth of itself.
+# A take of a few such pairs has thousands, whose mean says more than the pairs are alike.
 _MOST_PIXELS = 1000
 
 

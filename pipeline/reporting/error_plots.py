@@ -179,10 +179,10 @@ def _on_ground(run: RunData, sums: ErrorSums, ground: Ground) -> Figure:
         }
     )
     layout = {
-        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.0f", "zeroline": False},
+        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.3~f", "zeroline": False},
         "yaxis": {
             "title": {"text": ground.axes[1]},
-            "tickformat": ",.0f",
+            "tickformat": ",.3~f",
             "zeroline": False,
             "scaleanchor": "x",
         },

@@ -173,10 +173,10 @@ def _surveyed(run: RunData, ground: Ground) -> list[dict[str, Any]]:
 
 def _layout(ground: Ground, colours: PointColours | None) -> dict[str, Any]:
     return {
-        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.0f", "zeroline": False},
+        "xaxis": {"title": {"text": ground.axes[0]}, "tickformat": ",.3~f", "zeroline": False},
         "yaxis": {
             "title": {"text": ground.axes[1]},
-            "tickformat": ",.0f",
+            "tickformat": ",.3~f",
             "zeroline": False,
             "scaleanchor": "x",
             "scaleratio": 1,

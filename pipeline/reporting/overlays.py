@@ -251,7 +251,7 @@ def _error_panel(sheet: _Sheet, method: str, dots: _Dots, limit: float) -> Figur
     colours = coloured(dots.error_percent[order], -limit, limit, SIGNED)
     picture = painted(sheet.ground, sheet.full, dots.pixels[order], colours)
     caption = f"{len(order):,} pixels; red is too far."
-    bar = colour_bar("error (% of the reference)", -limit, limit, SIGNED)
+    bar = colour_bar("error (%)", -limit, limit, SIGNED)
     return _panel(sheet, f"{method}-error", f"Error of {label(method)}", caption, picture, bar)
 
 

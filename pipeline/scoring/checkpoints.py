@@ -21,8 +21,8 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.pose_errors import PoseErrors
 from pipeline.geometry.poses import Placement
-from pipeline.scoring.sighted import Sighted, best_shift
-from pipeline.scoring.sighting_errors import FrameErrors, place_covariance, shift_covariance
+from pipeline.scoring.sighted import Offsets, Sighted, best_shift
+from pipeline.scoring.sighting_errors import FrameErrors, stated_covariance
 from pipeline.sources.control_places import Mark
 
 REQUIRED = 30
@@ -72,8 +72,9 @@ def checkpoints(
         alone = sighted.where(sighted.point == point)
         # The shift that brings a point's surveyed place onto its own sightings is its error.
         error = best_shift(alone)
-        covariance = place_covariance(alone, alone.offsets(error), frame_errors, alone=False)
-        found.append(_checkpoint(alone, point, error, covariance, sigma_m))
+        at = alone.offsets(error)
+        covariance = stated_covariance(alone, at, _weight(at), frame_errors) + sigma_m**2 * np.eye(3)
+        found.append(_checkpoint(alone, point, error, covariance))
     return found
 
 
@@ -99,12 +100,30 @@ def left_one_out(
     frame_errors = FrameErrors.of(errors, sighted.frame_ids)
     found = []
     for point in _meeting(sighted):
-        alone, others = sighted.where(sighted.point == point), sighted.where(sighted.point != point)
+        mine = sighted.point == point
+        alone, others = sighted.where(mine), sighted.where(~mine)
         shift, error = best_shift(others), best_shift(alone)
-        covariance = place_covariance(alone, alone.offsets(error), frame_errors, alone=True)
-        covariance += shift_covariance(others, others.offsets(shift), frame_errors, sigma_m)
-        found.append(_checkpoint(alone, point, error - shift, covariance, sigma_m))
+        at = sighted.offsets(np.where(mine[:, None], error, shift))
+        weight = np.zeros((3, len(mine), 2))
+        weight[:, mine], weight[:, ~mine] = _weight(alone.offsets(error)), -_weight(others.offsets(shift))
+        covariance = stated_covariance(sighted, at, weight, frame_errors)
+        covariance += sigma_m**2 * _of_survey(sighted, np.einsum("dmk,mki->mdi", weight, at.by_shift))
+        found.append(_checkpoint(alone, point, error - shift, covariance))
     return found
+
+
+def _weight(at: Offsets) -> Floats:
+    """(3, m, 2) the shift by the offsets."""
+    inverse: Floats = np.linalg.pinv(at.by_shift.reshape(-1, 3))
+    return inverse.reshape(3, -1, 2)
+
+
+def _of_survey(sighted: Sighted, by_place: Floats) -> Floats:
+    """(3, 3) of sums that move by (m, 3, 3) with the places, each point's for itself and with a sigma of 1."""
+    by_point = np.zeros((len(sighted.names), 3, 3))
+    np.add.at(by_point, sighted.point, by_place)
+    out: Floats = np.einsum("pij,pkj->ik", by_point, by_point)
+    return out
 
 
 def _meeting(sighted: Sighted) -> list[int]:
@@ -118,8 +137,8 @@ def _meeting(sighted: Sighted) -> list[int]:
     return out
 
 
-def _checkpoint(alone: Sighted, point: int, error: Floats, covariance: Floats, sigma_m: float) -> Checkpoint:
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0) + sigma_m**2)
+def _checkpoint(alone: Sighted, point: int, error: Floats, covariance: Floats) -> Checkpoint:
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Checkpoint(alone.names[point], error, sigma, len(alone.point))
 
 

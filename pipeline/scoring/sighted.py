@@ -175,8 +175,7 @@ def best_shift(sighted: Sighted) -> Floats:
     shift = _nearest_to_rays(sighted)
     for _ in range(_STEPS):
         now = sighted.offsets(shift)
-        rows = now.by_shift.reshape(-1, 3)
-        step = np.linalg.lstsq(rows, now.found_px.ravel())[0]
+        step = np.linalg.lstsq(now.by_shift.reshape(-1, 3), now.found_px.ravel())[0]
         shift = shift - step
         if np.max(np.abs(step)) < _SETTLED_M:
             break
@@ -185,7 +184,8 @@ def best_shift(sighted: Sighted) -> Floats:
 
 def _nearest_to_rays(sighted: Sighted) -> Floats:
     """(3,) the shift with the least squares of the distances of the places from the rays of their sightings."""
-    across = np.eye(3) - np.einsum("mi,mj->mij", sighted.rays, sighted.rays)
+    rays = sighted.rays
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     away = sighted.centre - sighted.surveyed_m[sighted.point]
     out: Floats = np.linalg.lstsq(across.sum(axis=0), np.einsum("mij,mj->i", across, away))[0]
     return out

@@ -1,10 +1,14 @@
 """How far sightings may be from the projections of surveyed places, and how well a shift is known from what is left.
 
 A sighting is off by a click of its own, by the error of its frame, which all points in that frame share, and by the
-error of its point's survey, which all frames that see it share. With J the pixels by the shift, S the covariance of all
-of them and Q = I - J H^-1 J^T, H = J^T J, what is left of a least squares fit has the expected square tr(Q S). The
-shift's covariance is H^-1 J^T S J H^-1, S scaled so that this is the square that was found: the model tells how errors
-hang together, and the scatter how large they are.
+error of its point's survey, which all frames that see it share. With J the pixels by the shift, H = J^T J, and r what
+is left of a least squares fit, r = Q e with Q = I - J H^-1 J^T; the covariance of e is taken as a I + b B B^T, B the
+stated roots of frames and points. What is left says more of many clicks than of few shared errors, and these make the
+shift's sigma: both scales are found from r, and weighed against the stated ones,
+
+    E[r^T r] = a tr Q + b tr(B^T Q B),  E[|B^T r|^2] = a tr(B^T Q B) + b |B^T Q B|^2
+
+and the shift's covariance is a H^-1 + b H^-1 J^T B B^T J H^-1.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.sparse import coo_array, csr_array, hstack
 
 from pipeline.geometry.arrays import Floats, Ints
@@ -20,8 +25,9 @@ from pipeline.scoring.sighted import Offsets, Sighted
 
 # A mark is clicked, by hand or by a detector, to about a pixel of the photo.
 CLICK_PX = 1.0
-# A scale that rests on fewer squares than these says little.
-_LEAST_FREEDOM = 3.0
+# What is stated counts as much as so many squares that were found.
+_PRIOR_FREEDOM = 3.0
+_NOTHING = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,18 +35,18 @@ class FrameErrors:
     """What is known of the errors of frames, taken apart.
 
     Args:
-        errors: Of all frames.
-        number: (f,) in them, of the frames that have sightings.
         whole: (f, 6, 6) covariances of turn (rad) and shift (m), ENU.
         shared: (f, 6, 6) the part that is shared with other frames, by the mean of what is kept.
         own: (f, 6, 6) the rest.
+        couples: (2, k) different frames whose covariance is kept, each couple once.
+        blocks: (k, 6, 6) of the first by the second.
     """
 
-    errors: PoseErrors
-    number: Ints
     whole: Floats
     shared: Floats
     own: Floats
+    couples: Ints
+    blocks: Floats
 
     @staticmethod
     def of(errors: PoseErrors, frame_ids: tuple[str, ...]) -> FrameErrors:
@@ -54,22 +60,29 @@ class FrameErrors:
         whole = errors.of_numbers(number, number)[0]
         row = np.full(len(errors.index), -1)
         row[number] = np.arange(len(number))
-        ends = row[np.stack(np.divmod(errors.couples, len(errors.index)))]
+        ends: Ints = row[np.stack(np.divmod(errors.couples, len(errors.index)))]
         two = (ends[0] >= 0) & (ends[1] >= 0) & (ends[0] != ends[1])
-        both = 0.5 * (errors.blocks[two] + np.swapaxes(errors.blocks[two], 1, 2))
+        couples, blocks = ends[:, two], errors.blocks[two]
         total, count = np.zeros_like(whole), np.zeros(len(number))
-        for end in ends[:, two]:
-            np.add.at(total, end, both)
+        for end in couples:
+            np.add.at(total, end, 0.5 * (blocks + np.swapaxes(blocks, 1, 2)))
             np.add.at(count, end, 1.0)
         shared = total / np.maximum(count, 1.0)[:, None, None]
         root = _root(whole - shared)
-        return FrameErrors(errors, number, whole, shared, root @ np.swapaxes(root, 1, 2))
+        return FrameErrors(whole, shared, root @ np.swapaxes(root, 1, 2), couples, blocks)
 
-    def between(self, frame: Ints) -> Floats:
-        """(m, m, 6, 6) covariances between frames (m,), by what they share where none is kept."""
-        found, known = self.errors.of_numbers(*np.meshgrid(self.number[frame], self.number[frame], indexing="ij"))
-        shared = self.shared[frame]
-        return np.where(known[:, :, None, None], found, 0.5 * (shared[:, None] + shared[None]))
+    def of_sum(self, factors: Floats) -> Floats:
+        """(d, d) covariance of the sum of the frames' errors times factors (f, d, 6).
+
+        Where no covariance is kept between two frames, it is taken as the mean of what the two share with others.
+        """
+        one, other = self.couples
+        kept = self.blocks - 0.5 * (self.shared[one] + self.shared[other])
+        crossed = np.einsum("kdi,kij,kej->de", factors[one], kept, factors[other], optimize=True)
+        total = np.einsum("fdi,fij->dj", factors, self.shared) @ factors.sum(axis=0).T
+        alone = np.einsum("fdi,fij,fej->de", factors, self.whole - self.shared, factors, optimize=True)
+        out: Floats = alone + crossed + crossed.T + 0.5 * (total + total.T)
+        return out
 
     def expected_px(self, sighted: Sighted, offsets: Offsets, sigma_m: float) -> Floats:
         """(m,) one sigma of the distances that a shift cannot remove: a shift that frames share it does.
@@ -96,47 +109,52 @@ def shift_covariance(sighted: Sighted, offsets: Offsets, errors: FrameErrors, si
         errors: Of the frames.
         sigma_m: Of the survey along each axis.
 
-    Source: the scale's distribution by the first two moments of the sum of squares (Satterthwaite, Biometrics Bulletin
-    2, 1946); its share nu / (nu - 2) is the variance of Student's distribution.
+    Source: moments of quadratic forms as in MINQUE (Rao, Journal of Multivariate Analysis 1, 1971); their degrees of
+    freedom after Satterthwaite (Biometrics Bulletin 2, 1946).
     """
     roots = _roots(sighted, offsets, errors, sigma_m)
-    by_shift = offsets.by_shift.reshape(-1, 3)
+    by_shift, left = offsets.by_shift.reshape(-1, 3), offsets.found_px.ravel()
     # Not the inverse: weak geometry shall be seen in the sigmas, and not end the run.
     inverse = np.linalg.pinv(by_shift.T @ by_shift, hermitian=True)
-    shared = np.asarray(roots.T @ by_shift)
-    folded = shared.T @ shared
-    click = CLICK_PX**2
-    by_click = click * (2.0 * np.count_nonzero(offsets.seen) - 3.0)
-    by_roots = float(roots.multiply(roots).sum()) - float(np.trace(inverse @ folded))
-    gram = roots.T @ roots
-    crossed = float(gram.multiply(gram).sum()) - 2.0 * float(np.trace(inverse @ shared.T @ (gram @ shared)))
-    crossed += float(np.sum((inverse @ folded) * (inverse @ folded).T))
-    expected = by_click + by_roots
-    freedom = max(expected**2 / (click * by_click + 2.0 * click * by_roots + crossed), _LEAST_FREEDOM)
-    scale = float(np.sum(offsets.found_px**2)) / expected * freedom / (freedom - 2.0)
-    out: Floats = scale * (click * inverse + inverse @ folded @ inverse)
+    along = np.asarray(roots.T @ by_shift)
+    folded, gram = inverse @ (along.T @ along), roots.T @ roots
+    single = 2.0 * np.count_nonzero(offsets.seen) - 3.0
+    mixed = float(roots.multiply(roots).sum() - np.trace(folded))
+    shared = float(gram.multiply(gram).sum() - 2.0 * np.trace(inverse @ along.T @ (gram @ along)))
+    shared += float(np.sum(folded * folded.T))
+    a, b = _scales(single, mixed, shared, np.array([np.sum(left**2), np.sum((roots.T @ left) ** 2)]))
+    out: Floats = a * inverse + b * folded @ inverse
     return out
 
 
-def place_covariance(sighted: Sighted, offsets: Offsets, errors: FrameErrors, *, alone: bool) -> Floats:
-    """(3, 3) m^2 of the place where the rays of one point meet, by the sigmas of clicks and poses.
+def _scales(single: float, mixed: float, shared: float, squares: Floats) -> Floats:
+    """(2,) variances of a click, px^2, and of the stated roots, 1, by the traces of the two forms and their squares.
+
+    What few squares say is as uncertain as they are few: they are weighed against what is stated, as the mean of an
+    inverse chi-squared distribution that began with the stated ones.
+    """
+    stated = np.array([CLICK_PX**2, 1.0])
+    expected = np.array([[single, mixed], [mixed, shared]])
+    weight = 1.0 / np.sqrt(np.maximum([single, shared], _NOTHING))
+    found = nnls(expected * weight[:, None], squares * weight)[0]
+    freedom = np.array([single, mixed**2 / max(shared, _NOTHING)])
+    out: Floats = (freedom * found + _PRIOR_FREEDOM * stated) / (freedom + _PRIOR_FREEDOM - 2.0)
+    return out
+
+
+def stated_covariance(sighted: Sighted, offsets: Offsets, weight: Floats, errors: FrameErrors) -> Floats:
+    """(3, 3) m^2 of weighted sums of offsets, by the sigmas that clicks and poses are stated with.
 
     Args:
-        sighted: The sightings of the point.
-        offsets: At the place where its rays meet.
+        sighted: The sightings.
+        offsets: At the places where they are taken to be.
+        weight: (3, m, 2) m / px.
         errors: Of the frames.
-        alone: Whether only what frames do not share counts: the rest moves all points alike.
     """
-    frames = sighted.frame
-    if alone:
-        same = frames[:, None] == frames[None]
-        between = np.where(same[:, :, None, None], errors.own[frames][:, None], 0.0)
-    else:
-        between = errors.between(frames)
-    of_pixels = np.einsum("mki,mnij,nlj->mknl", offsets.by_pose, between, offsets.by_pose)
-    flat = of_pixels.reshape(2 * len(frames), -1) + CLICK_PX**2 * np.eye(2 * len(frames))
-    place = np.linalg.pinv(offsets.by_shift.reshape(-1, 3))
-    out: Floats = place @ flat @ place.T
+    factors = np.zeros((len(errors.whole), 3, 6))
+    np.add.at(factors, sighted.frame, np.einsum("dmk,mki->mdi", weight, offsets.by_pose))
+    flat = weight.reshape(3, -1)
+    out: Floats = errors.of_sum(factors) + CLICK_PX**2 * flat @ flat.T
     return out
 
 

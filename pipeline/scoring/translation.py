@@ -143,23 +143,28 @@ def solve_translation(
 
 
 def _agreeing(sighted: Sighted, errors: FrameErrors, sigma_m: float) -> tuple[Sighted, set[int]]:
-    """The sightings of the points that agree, and the points that do not agree with them."""
-    kept, doubted = sighted, set[int]()
-    while len(kept.points) >= FEWEST_POINTS:
-        point = _least_fitting(kept)
-        without = kept.where(kept.point != point)
-        shift = best_shift(without)
-        others = without.offsets(shift)
-        alone = kept.where(kept.point == point)
-        off = alone.offsets(shift)
+    """The sightings of the points that agree, and the points that do not agree with them.
+
+    Two wrong points hide one another while either is in the fit: more than half of the points, those that fit best,
+    say which of the others belong to them.
+    """
+    kept = sighted
+    while len(kept.points) > len(sighted.points) // 2 + 1:
+        kept = kept.where(kept.point != _least_fitting(kept))
+    points = sighted.points
+    while True:
+        shift = best_shift(kept)
         # The fit takes three numbers: one and a half of the distances.
-        scatter = np.sqrt(np.sum(others.distance_px**2) / max(len(without.point) - 1.5, 0.5))
-        expected = np.sqrt(np.mean(errors.expected_px(alone, off, sigma_m) ** 2))
-        if not np.sqrt(np.mean(off.distance_px**2)) > _DOUBTFUL * np.hypot(scatter, expected):
-            break
-        kept = without
-        doubted.add(point)
-    return kept, doubted
+        freedom = max(len(kept.point) - 1.5, 0.5)
+        scatter = np.sum(kept.offsets(shift).distance_px ** 2) / freedom
+        at = sighted.offsets(shift)
+        expected = _by_point(sighted, errors.expected_px(sighted, at, sigma_m) ** 2)[points]
+        off, count = (_by_point(sighted, values)[points] for values in (at.distance_px**2, np.ones(len(at.seen))))
+        fitting = points[off <= _DOUBTFUL**2 * (count * scatter + expected)]
+        agreed = np.union1d(fitting, kept.points)
+        if len(agreed) == len(kept.points):
+            return kept, set(points.tolist()) - set(agreed.tolist())
+        kept = sighted.where(np.isin(sighted.point, agreed))
 
 
 def _least_fitting(sighted: Sighted) -> int:
@@ -173,8 +178,8 @@ def _least_fitting(sighted: Sighted) -> int:
     step = (np.linalg.pinv(rest, hermitian=True) @ pull[:, :, None])[:, :, 0]
     left = squares.sum() - squares - np.sum(pull * step, axis=1)
     # Points out of sight are worse than any that can be measured.
-    order = np.lexsort((left, -unseen))
-    return int(next(i for i in order if i in set(sighted.points.tolist())))
+    points = sighted.points
+    return int(points[np.lexsort((left[points], -unseen[points]))[0]])
 
 
 def _by_point(sighted: Sighted, values: Floats) -> Floats:

@@ -6,11 +6,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
-from control_scenes import CLICK_PX, FRAMES, SURVEY_M, Scene, on_the_ground, scene
+from control_scenes import CLICK_PX, FRAMES, SURVEY_M, Scene, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planted_bias import shifted_survey
 from refinement_scenes import CAMERA, COMMON, DEG, NONE, OWN, nees
 from scipy.optimize import least_squares
 
@@ -345,6 +347,29 @@ def test_a_point_under_the_camera_or_behind_it_is_no_trouble() -> None:
         assert all(np.all(np.isfinite(discs)) for discs in around.discs.values())
 
 
+# --- the benchmark ---
+
+
+def test_the_planted_survey_is_the_example_elsewhere(tmp_path: Path) -> None:
+    example, shift = tmp_path / "example", np.array([18.0, -14.0, 10.0])
+    (example / "lidar").mkdir(parents=True)
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = np.array([738000.0, 4153000.0, 0.0]), np.full(3, 0.001)
+    tile = laspy.LasData(header)
+    tile.xyz = np.random.default_rng(0).uniform(0.0, 100.0, (50, 3)) + header.offsets
+    tile.write(example / "lidar" / "tile.laz")
+    rows = "738668.4448\t4153830.7326\t154.9032\t91.357\t793.910\tDJI_0001.JPG\tgcp01"
+    (example / "gcp_list.txt").write_text(f"EPSG:32617\n{rows}\n")
+    folder = shifted_survey(example, tmp_path, shift)
+    moved, before = (laspy.read(path / "lidar" / "tile.laz") for path in (folder, example))
+    np.testing.assert_array_equal(moved.X, before.X)
+    np.testing.assert_allclose(np.asarray(moved.xyz) - np.asarray(before.xyz), np.tile(shift, (50, 1)), atol=1e-6)
+    np.testing.assert_allclose(moved.header.mins, before.header.mins + shift, atol=1e-6)
+    points = [read_control_points((path / "gcp_list.txt").read_bytes()) for path in (folder, example)]
+    np.testing.assert_allclose(np.subtract(*(one.points[0].xyz for one in points)), shift, atol=1e-6)
+    assert points[0].sightings == points[1].sightings
+
+
 @pytest.mark.real
 def test_a_real_list_that_is_read_in_wrong_places_is_refused(shared: Path) -> None:
     text = (shared / "data/photos/sheffield_cross/gcp_file.txt").read_text()
@@ -353,8 +378,3 @@ def test_a_real_list_that_is_read_in_wrong_places_is_refused(shared: Path) -> No
     listed = read_control_points("\n".join([head, *exchanged]).encode(), "gcp_file.txt")
     with pytest.raises(InputError, match="E-CONTROL-11"):
         surveyed(listed, LocalFrame(28.04, -82.70, 3.0), ELLIPSOIDAL, None, ELLIPSOIDAL, "score.control_height_datum")
-
-
-def test_places_on_the_ground_are_seen_by_most_frames() -> None:
-    assert on_the_ground(np.random.default_rng(0), 3).shape == (3, 3)
-    assert min(len(mark.frames) for mark in scene(0, 10).marks) >= FRAMES - 2

@@ -114,7 +114,7 @@ def left_one_out(
 
 def _weight(at: Offsets) -> Floats:
     """(3, m, 2) the shift by the offsets."""
-    inverse: Floats = np.linalg.pinv(at.by_shift.reshape(-1, 3))
+    inverse: Floats = np.asarray(np.linalg.pinv(at.by_shift.reshape(-1, 3)), np.float64)
     return inverse.reshape(3, -1, 2)
 
 

@@ -187,12 +187,13 @@ def test_a_point_in_a_wrong_photo_is_found_and_left_out(seed: int, own: PoseSigm
     pixels = now.marks[2].pixels.copy()
     pixels[[1, 6]] = pixels[[6, 1]]
     found = replace(now, marks=[*now.marks[:2], replace(now.marks[2], pixels=pixels), now.marks[3]]).solved()
+    assert found.rests_on(now.marks) == now.without(2).marks
     without = now.without(2).solved()
     np.testing.assert_allclose(found.translation_m, without.translation_m, atol=1e-9)
     metrics = found.metrics({})
     assert (metrics["points"], metrics["observations"]) == (3, 3 * FRAMES)
     (suspect,) = metrics["suspects"]
-    assert (suspect["name"], suspect["worst_frame"] in {"f01", "f06"}) == ("gcp2", True)
+    assert (suspect["name"], suspect["fits"], suspect["worst_frame"] in {"f01", "f06"}) == ("gcp2", None, True)
     assert suspect["rms_px"] > 40.0
     assert metrics["by_point"]["gcp2"]["rms_after_px"] == suspect["rms_px"]
     assert "gcp2" in found.told[0]
@@ -209,12 +210,12 @@ def test_a_mistyped_coordinate_is_found(seed: int) -> None:
 
 def test_exchanged_names_are_both_found_among_six_and_refused_among_five() -> None:
     found = swapped(scene(0, 6, BIAS), 1, 4).solved()
-    assert [fit.name for fit in found.points if fit.suspect] == ["gcp1", "gcp4"]
+    assert [(fit.name, fit.fits) for fit in found.points if fit.suspect] == [("gcp1", "gcp4"), ("gcp4", "gcp1")]
     assert np.all(np.abs(found.translation_m - BIAS) < 0.4)
     with pytest.raises(InputError, match="E-CONTROL-17") as told:
         swapped(scene(0, 5, BIAS), 1, 4).solved()
-    assert "gcp1" in told.value.found
-    assert "gcp4" in told.value.found
+    assert "its pixels fit gcp1" in told.value.found
+    assert "its pixels fit gcp4" in told.value.found
 
 
 def test_one_wrong_point_of_three_is_refused() -> None:

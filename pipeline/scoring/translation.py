@@ -45,6 +45,7 @@ class PointFit:
         before_px: (m,) as surveyed; infinite where the camera does not see it.
         after_px: (m,) shifted by the translation.
         suspect: Whether it does not fit the others, and was left out of the fit.
+        fits: Another point whose place these sightings fit, where it is a suspect; "" where there is none.
     """
 
     name: str
@@ -52,6 +53,7 @@ class PointFit:
     before_px: Floats
     after_px: Floats
     suspect: bool
+    fits: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,11 @@ class Translation:
     covariance: Floats
     points: tuple[PointFit, ...]
     told: tuple[str, ...]
+
+    def rests_on(self, marks: Sequence[Mark]) -> list[Mark]:
+        """Those of the points that it was solved from that were not left out."""
+        used = {fit.name for fit in self.points if not fit.suspect}
+        return [mark for mark in marks if mark.name in used]
 
     def metrics(self, left_out: Mapping[str, str]) -> dict[str, Any]:
         """The object `control_points` of metrics.json; what was out of sight before has no pixels, and is counted.
@@ -95,7 +102,12 @@ class Translation:
                 for fit in self.points
             },
             "suspects": [
-                {"name": fit.name, "rms_px": _rms(fit.after_px), "worst_frame": _worst_frame(fit)}
+                {
+                    "name": fit.name,
+                    "rms_px": _rms(fit.after_px),
+                    "worst_frame": _worst_frame(fit),
+                    "fits": fit.fits or None,
+                }
                 for fit in self.points
                 if fit.suspect
             ],
@@ -198,8 +210,17 @@ def _fits(sighted: Sighted, shift: Floats, doubted: set[int]) -> tuple[PointFit,
     for point in sighted.points.tolist():
         rows: Bools = sighted.point == point
         frames = tuple(sighted.frame_ids[i] for i in sighted.frame[rows])
-        fits.append(PointFit(sighted.names[point], frames, before[rows], after[rows], point in doubted))
+        whose = _whose(sighted.where(rows), shift) if point in doubted else ""
+        fits.append(PointFit(sighted.names[point], frames, before[rows], after[rows], point in doubted, whose))
     return tuple(fits)
+
+
+def _whose(alone: Sighted, shift: Floats) -> str:
+    """The point whose place the sightings of another one fit."""
+    own = alone.surveyed_m[alone.point]
+    left = [float(np.median(alone.offsets(shift + place - own).distance_px)) for place in alone.surveyed_m]
+    best = int(np.argmin(left))
+    return alone.names[best] if left[best] <= _WRONG_PX and best not in alone.point else ""
 
 
 def _check_fit(
@@ -266,8 +287,8 @@ def _doubts(at: Offsets, shift: Floats, covariance: Floats, errors: FrameErrors,
         if fit.suspect:
             others = _rms(np.concatenate([other.after_px for other in fits if not other.suspect]))
             told.append(
-                f"control point {_named(fit)}, where the others are {others:.1f} px; it was left out: see its images, "
-                "name and coordinates"
+                f"control point {_named(fit)} does not fit the others, which are {others:.1f} px off; it was left out: "
+                "see its images, name and coordinates"
             )
     allowed = np.sqrt(np.median(np.diagonal(errors.whole, axis1=1, axis2=2), axis=0)[3:])
     if np.any(np.abs(shift) > _FAR_SIGMAS * np.hypot(allowed, np.sqrt(np.diag(covariance)))):
@@ -290,9 +311,10 @@ def _doubts(at: Offsets, shift: Floats, covariance: Floats, errors: FrameErrors,
 
 
 def _named(fit: PointFit) -> str:
-    return (
-        f"{fit.name} ({_said(float(np.median(fit.after_px)))} in {len(fit.frames)} photos, most in {_worst_frame(fit)})"
-    )
+    far, worst = int(np.sum(fit.after_px > _WRONG_PX)), _said(float(np.max(fit.after_px)))
+    whose = f"; its pixels fit {fit.fits}" if fit.fits else ""
+    photos = f"{far} of {len(fit.frames)} photos more than {_WRONG_PX:g} px off"
+    return f"{fit.name} ({photos}, {_worst_frame(fit)} most: {worst}{whose})"
 
 
 def _worst_frame(fit: PointFit) -> str:

@@ -25,8 +25,9 @@ from pipeline.refinement.matched import Matched, by_pair
 from pipeline.refinement.near import together
 from pipeline.refinement.pair import refine_pair, surest_frames
 from pipeline.refinement.rows import FLIGHT, PAIR, RefinedPair, cameras_table, covariances_table, pair_row, poses_table
-from pipeline.refinement.surveyed import Survey, doubts, survey
+from pipeline.refinement.surveyed import controls, doubts
 from pipeline.refinement.telling import facts_of, sentence, warnings_of
+from pipeline.sources.control_survey import ControlSurvey, survey
 from pipeline.sources.files import is_url
 from schemas import MATCHES, RELATIVE_POSES
 
@@ -150,7 +151,7 @@ def _control(config: Config, context: Context, log: Log) -> list[Control]:
         return []
     found = _survey(config, context.setting("ingest.geoid"), context.facts("ingest"))
     names = (column(context.read("frames"), name) for name in ("frame_id", "image"))
-    control, left_out = found.controls(dict(zip(*names, strict=True)), log, config.control_sigma_m)
+    control, left_out = controls(found, dict(zip(*names, strict=True)), log, config.control_sigma_m)
     context.record("control_heights", found.height_note)
     context.record("control_left_out", left_out)
     for named, why in list(left_out.items())[:1]:
@@ -158,8 +159,8 @@ def _control(config: Config, context: Context, log: Log) -> list[Control]:
     return control
 
 
-def _survey(config: Config, geoid: Any, facts: Mapping[str, Any]) -> Survey:
-    return survey(str(config.control_points), config.control_height_datum, facts, geoid)
+def _survey(config: Config, geoid: Any, facts: Mapping[str, Any]) -> ControlSurvey:
+    return survey(str(config.control_points), config.control_height_datum, facts, geoid, "refine")
 
 
 def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, Any]) -> None:

@@ -53,7 +53,7 @@ from pipeline.refinement.flight.stars import stars_by_ref
 from pipeline.refinement.logged import Log
 from pipeline.refinement.near import together
 from pipeline.refinement.scatter import SHARED_PX
-from pipeline.refinement.surveyed import control_facts, doubts, survey
+from pipeline.refinement.surveyed import control_facts, doubts
 from pipeline.sources.control_places import marks_of, surveyed
 from pipeline.sources.control_points import (
     ControlList,
@@ -62,6 +62,7 @@ from pipeline.sources.control_points import (
     load_control_points,
     read_control_points,
 )
+from pipeline.sources.control_survey import survey
 from stages.refine import Config
 
 HEAD = "EPSG:32617\n"
@@ -256,7 +257,7 @@ def test_swapped_axes_are_far_away() -> None:
 
 def test_a_flight_in_a_frame_of_its_own_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UndeterminedError, match="E-CONTROL-12"):
-        survey(str(tmp_path / "gcp_list.txt"), None, {"world": "local", "origin": None}, None)
+        survey(str(tmp_path / "gcp_list.txt"), None, {"world": "local", "origin": None}, None, "refine")
 
 
 # --- its photos ---

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pipeline.engine.errors import InputError, NothingLeftError, UndeterminedError
-from pipeline.geodesy.enu import LocalFrame
-from pipeline.geodesy.local_world import EARTH, LOCAL_WORLD
+from pipeline.engine.errors import InputError
 from pipeline.geometry.arrays import Floats
 from pipeline.refinement.flight.control import Control, ControlFit
 from pipeline.refinement.flight.flight import RefinedFlight
 from pipeline.refinement.logged import Log
-from pipeline.sources.control_places import marks_of, surveyed
-from pipeline.sources.control_points import ControlList, load_control_points
+from pipeline.sources.control_places import marks_of
+from pipeline.sources.control_survey import ControlSurvey
 
-_KEY = "refine.control_height_datum"
 # A mark that is clicked in its own photo is off by a few pixels at most.
 _WRONG_PX = 20.0
 # Coordinates that are worse than this may look wrong in a photo and be right.
@@ -26,70 +22,28 @@ _SURVEYED_M = 0.2
 _FAR_SIGMAS = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class Survey:
-    """A list of control points and where they lie.
+def controls(
+    found: ControlSurvey, images: Mapping[str, str], log: Log, sigma_m: float
+) -> tuple[list[Control], dict[str, str]]:
+    """The points that the flight's frames see, and why some rows are left out, by photo and line.
 
     Args:
-        listed: The list.
-        places_m: (n, 3) of its points, ENU.
-        height_note: What was done with their heights.
-    """
-
-    listed: ControlList
-    places_m: Floats
-    height_note: str
-
-    def controls(self, images: Mapping[str, str], log: Log, sigma_m: float) -> tuple[list[Control], dict[str, str]]:
-        """The points that the flight's frames see, and why some rows are left out, by photo and line.
-
-        Args:
-            images: Path of every image by frame_id.
-            log: The flight, whose order numbers the frames.
-            sigma_m: One sigma of the survey.
-
-        Raises:
-            InputError: A pixel lies outside its photo.
-            NothingLeftError: No row is of a photo of the flight.
-        """
-        marks, left_out = marks_of(self.listed, self.places_m, images, log.cameras)
-        number = {name: i for i, name in enumerate(log.poses)}
-        found = [
-            Control(mark.name, mark.surveyed_m, sigma_m, np.array([number[name] for name in mark.frames]), mark.pixels)
-            for mark in marks
-        ]
-        return found, left_out
-
-
-def survey(location: str, stated: str | None, facts: Mapping[str, Any], geoid: float | str | None) -> Survey:
-    """The control points of a flight.
-
-    Args:
-        location: Path or URL of the list.
-        stated: What their heights are measured from, where their CRS does not say.
-        facts: Of ingest.
-        geoid: As configured.
+        found: The list.
+        images: Path of every image by frame_id.
+        log: The flight, whose order numbers the frames.
+        sigma_m: One sigma of the survey.
 
     Raises:
-        InputError: The list cannot be read, or its points lie elsewhere.
-        UndeterminedError: The flight lies nowhere on earth, or a height datum is not known.
-        UsageError: `stated` is no height datum.
-        NothingLeftError: No frame of the flight is usable.
+        InputError: A pixel lies outside its photo.
+        NothingLeftError: No row is of a photo of the flight.
     """
-    if facts.get("world", EARTH) == LOCAL_WORLD:
-        raise UndeterminedError(
-            "E-CONTROL-12", "control points are on earth, and nothing says where on earth the run's frame lies",
-            where="refine.control_points", found=location, expected="a flight whose poses have latitude and longitude",
-            hint="leave refine.control_points out",
-        )  # fmt: skip
-    listed = load_control_points(location)
-    if facts["origin"] is None:
-        raise NothingLeftError(
-            "E-CONTROL-13", "no photo of the flight is usable, and control points are of no help", where=location,
-            hint="the table frames says why; leave refine.control_points out to go on",
-        )  # fmt: skip
-    frame = LocalFrame(**facts["origin"])
-    return Survey(listed, *surveyed(listed, frame, str(facts["height_datum"]), geoid, stated, _KEY))
+    marks, left_out = marks_of(found.listed, found.places_m, images, log.cameras)
+    number = {name: i for i, name in enumerate(log.poses)}
+    points = [
+        Control(mark.name, mark.surveyed_m, sigma_m, np.array([number[name] for name in mark.frames]), mark.pixels)
+        for mark in marks
+    ]
+    return points, left_out
 
 
 def control_facts(fits: Sequence[ControlFit]) -> dict[str, Any]:

@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeline.engine.errors import NothingLeftError
 from pipeline.engine.stage import Context
+from pipeline.lidar.nearby import LocalTiles
+from pipeline.lidar.store import gather
 from pipeline.scoring.depth_images import DepthImages
 from pipeline.scoring.frame_scores import FrameScore
 from pipeline.scoring.inputs import TilesNamed, times_of
@@ -24,11 +26,13 @@ class Believed:
     Args:
         truth: For scoring.
         kind: "tiles", "sweeps" or "depth images".
+        tiles: Of a survey, those that meet the flight; None for depth images.
         nothing: The refusal when no depth has a reference.
     """
 
     truth: Truth
     kind: str
+    tiles: LocalTiles | None
     nothing: Callable[[Sequence[FrameScore]], NothingLeftError]
 
 
@@ -48,7 +52,7 @@ def survey(
         InputError: No tile, or one that cannot be read.
         UndeterminedError: Where tiles lie, or what heights are measured from, is not known.
         UsageError: There are neither tiles nor sweeps.
-        NothingLeftError: The tiles lie elsewhere.
+        NothingLeftError: The tiles lie elsewhere, or hold only noise.
     """
     tiles = named.local(context)
     centres = np.array([item.view.centre_in_enu_m for item in views])
@@ -63,8 +67,11 @@ def survey(
         matches, visible = (sum(getattr(score, name) for score in scores) for name in ("n_matches", "n_visible"))
         return no_reference(matches, visible, tiles, max_range_m)
 
-    truth = Survey(replace(tiles, tiles=meeting), max_range_m, margin_m)
-    return Believed(truth, "sweeps" if named.lidar is None else "tiles", nothing)
+    met = replace(tiles, tiles=meeting)
+    focal_px = max(item.view.camera.focal_px for item in views)
+    store = gather(context.map, met, centres, max_range_m + margin_m, context.scratch / "returns", focal_px)
+    truth = Survey(store, met.from_above, max_range_m, margin_m)
+    return Believed(truth, "sweeps" if named.lidar is None else "tiles", met, nothing)
 
 
 def depth_images(context: Context, location: str, units_per_metre: float, max_range_m: float) -> Believed:
@@ -87,4 +94,4 @@ def depth_images(context: Context, location: str, units_per_metre: float, max_ra
     def nothing(scores: Sequence[FrameScore]) -> NothingLeftError:
         return no_depth_seen(location, scores[0].frame_id, sum(score.n_visible for score in scores), units_per_metre)
 
-    return Believed(DepthImages(found, units_per_metre, max_range_m), "depth images", nothing)
+    return Believed(DepthImages(found, units_per_metre, max_range_m), "depth images", None, nothing)

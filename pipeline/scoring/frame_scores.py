@@ -9,10 +9,12 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.geometry.arrays import Bools, Floats
+from pipeline.scoring.cloud_scores import CloudJob, CloudScore, score_cloud
 from pipeline.scoring.depth_rows import AlignedDepths
 from pipeline.scoring.frame_sums import FrameSums, Scored
 from pipeline.scoring.lines import Lines, NearLines
-from pipeline.scoring.truth import FrameTruth, FrameView, NearTruth, Truth
+from pipeline.scoring.point_rows import NearPoints
+from pipeline.scoring.truth import FrameTruth, FrameView, NearTruth, SurveyNear, SurveySeen, Truth
 from schemas import SCORES
 
 
@@ -39,11 +41,13 @@ class Baselines:
         names: Of the methods.
         images: Where the frames' images lie.
         depths_at: From an image's location and pixels (n, 2) to depths (n,) m by name, NaN for none.
+        device: What their networks run on.
     """
 
     names: tuple[str, ...]
     images: Mapping[str, str]
     depths_at: Callable[[str, Floats], Mapping[str, Floats]]
+    device: str = "cpu"
 
     def beside(self, lines: AlignedDepths, frame_id: str) -> AlignedDepths:
         """The lines of a frame with these methods beside the others."""
@@ -64,6 +68,7 @@ class ScoringJob:
         max_range_m: Largest Euclidean distance from the camera that is scored, m.
         baselines: Further methods.
         correction: Where there are control points.
+        cloud: Where fused points are held against returns.
         shard: Frames that are scored together.
         here: Whether a device does the work, and not the cores.
     """
@@ -73,6 +78,7 @@ class ScoringJob:
     max_range_m: float
     baselines: Baselines | None = None
     correction: Correction | None = None
+    cloud: CloudJob | None = None
     shard: int = 8
     here: bool = False
 
@@ -106,10 +112,12 @@ class ShardScores:
     Args:
         pixels: Rows of the table `pixels`.
         frames: One score per frame.
+        cloud: Of the fused points, where they are scored.
     """
 
     pixels: pa.Table
     frames: list[FrameScore]
+    cloud: CloudScore | None = None
 
 
 def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> list[ShardScores]:
@@ -127,24 +135,44 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> list[ShardScore
         InputError: The truth is damaged, an image cannot be read, or the rows of `depths` do not belong together.
         UndeterminedError: A height datum or the geoid between two is not known.
     """
-    near, lines = job.truth.near(items), job.lines.near(items)
-    if job.correction is None:
-        return [_against(job, near, lines, items)]
-    corrected = [_corrected(item, job.correction) for item in items]
-    moved = near.moved(job.correction.translation_m)
-    return [_against(job, moved, lines, corrected), _against(job, near, lines, items)]
+    near, correction = job.truth.near(items), job.correction
+    held = _Held(job.lines.near(items), job.cloud.near(items) if job.cloud else None)
+    if correction is None:
+        return [_against(job, near, held, items)]
+    corrected = [_corrected(item, correction) for item in items]
+    moved = near.moved(correction.translation_m)
+    return [_against(job, moved, held, corrected, correction.covariance), _against(job, near, held, items)]
 
 
-def _against(job: ScoringJob, near: NearTruth, lines: NearLines, items: Sequence[FrameView]) -> ShardScores:
-    tables, scores = [], []
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """What is scored of some frames."""
+
+    lines: NearLines
+    points: NearPoints | None
+
+
+def _against(
+    job: ScoringJob,
+    near: NearTruth,
+    held: _Held,
+    items: Sequence[FrameView],
+    shift_covariance: Floats | None = None,
+) -> ShardScores:
+    tables, scores, saw = [], [], []
     for item in items:
         seen = near.seen_by(item)
-        mine = lines.of(item, seen)
+        mine = held.lines.of(item, seen)
         scored = _scored(job, item, seen, mine)
         sums = FrameSums.of(scored, job.max_range_m)
         scores.append(FrameScore(item.frame_id, len(mine.pixels), len(seen.depth_m), sums))
         tables.append(_table(scored))
-    return ShardScores(pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores)
+        saw.append(seen)
+    cloud = None
+    if job.cloud is not None and held.points is not None and isinstance(near, SurveyNear):
+        returns = [seen for seen in saw if isinstance(seen, SurveySeen)]
+        cloud = score_cloud(job.cloud, held.points, near, items, returns, shift_covariance)
+    return ShardScores(pa.concat_tables(tables).combine_chunks() if tables else SCORES.empty(), scores, cloud)
 
 
 def _corrected(item: FrameView, correction: Correction) -> FrameView:

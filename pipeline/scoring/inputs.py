@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,12 @@ from pipeline.lidar.visibility import View
 from pipeline.matching.matcher import SearchLimits
 from pipeline.matching.matchers import MatcherSetting, device_of, weights_of
 from pipeline.matching.reach import Band
+from pipeline.monodepth.baselines import BaselineSetting, depths_at
+from pipeline.scoring.cloud_scores import CloudJob, survey_covariance
 from pipeline.scoring.dense import DenseLines, DensePair
-from pipeline.scoring.lines import SparseLines, methods_of
+from pipeline.scoring.frame_scores import Baselines
+from pipeline.scoring.lines import Lines, SparseLines, methods_of
+from pipeline.scoring.point_rows import PointsNear
 from pipeline.scoring.refusals import check_datums, nothing_to_score_against
 from pipeline.scoring.truth import FrameView
 
@@ -125,6 +130,56 @@ def sparse_lines(context: Context) -> SparseLines:
 def images_of(context: Context) -> dict[str, str]:
     """Where the images of usable frames lie, by frame_id."""
     return image_locations(context.read("frames"), str(context.facts("ingest")["photo_root"]), context.path("images"))
+
+
+def baselines_of(context: Context, names: tuple[str, ...], models: str | None) -> Baselines | None:
+    """Networks that look at one image alone; None of none. What they are is recorded.
+
+    Args:
+        context: Of the stage.
+        names: Of the methods.
+        models: Where their networks are looked for first.
+
+    Raises:
+        InputError: A folder holds no such model.
+        MissingPartError: transformers is not installed, or a model is nowhere.
+        ResourceError: The device is not there.
+    """
+    if not names:
+        return None
+    found = BaselineSetting.find(names, models, context.setting("match.device"))
+    context.record("baselines", {model.baseline: model.provenance for model in found.models})
+    return Baselines(names, images_of(context), partial(depths_at, found), found.device)
+
+
+def device_of_job(lines: Lines, baselines: Baselines | None) -> str:
+    """What the networks of a job run on; "cpu" where there are none."""
+    used = [lines.matcher.device] if isinstance(lines, DenseLines) else []
+    used += [baselines.device] if baselines else []
+    return next((device for device in used if device != "cpu"), "cpu")
+
+
+def cloud_of(
+    context: Context, tiles: LocalTiles | None, max_range_m: float, lidar_sigma_m: float | None
+) -> CloudJob | None:
+    """The fused points, to be held against returns; None where there are no points, or no returns.
+
+    Args:
+        context: Of the stage.
+        tiles: The survey.
+        max_range_m: Largest distance from the camera that is scored, m.
+        lidar_sigma_m: One sigma of a return as stated.
+
+    Raises:
+        InputError: The points cannot be read.
+    """
+    folder = context.path("points")
+    if tiles is None or not folder.exists():
+        return None
+    points = PointsNear.of(folder, tiles.frame, tiles.geoid, tiles.height_datum)
+    covariance = survey_covariance(tiles.tiles, lidar_sigma_m)
+    context.record("returns_carry_covariance", covariance is not None)
+    return CloudJob(points, max_range_m, covariance)
 
 
 def dense_lines(context: Context, matcher: str, most: int) -> DenseLines:

@@ -10,9 +10,9 @@ import numpy as np
 
 from pipeline.geometry.arrays import Floats
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
-from pipeline.lidar.nearby import LocalTiles, returns_near
 from pipeline.lidar.reference import Reference, reference_depth
 from pipeline.lidar.spacing import surface_spacing_m
+from pipeline.lidar.store import Store
 from pipeline.lidar.visibility import View, VisibleReturns, behind_columns, visible_returns
 
 
@@ -71,25 +71,22 @@ class Survey:
     """Returns of tiles or of the run's own sweeps.
 
     Args:
-        tiles: The LiDAR tiles and the way from their CRS.
+        returns: Those about the flight, in the local frame.
+        from_above: Whether they are a survey from the air.
         max_range_m: Largest Euclidean distance from the camera that is scored, m.
         margin_m: How far the returns may be shifted afterwards, m.
     """
 
-    tiles: LocalTiles
+    returns: Store
+    from_above: bool
     max_range_m: float
     margin_m: float = 0.0
 
     def near(self, frames: Sequence[FrameView]) -> SurveyNear:
-        """As `Truth.near`.
-
-        Raises:
-            InputError: A tile is damaged.
-            UndeterminedError: A height datum or the geoid between two is not known.
-        """
+        """As `Truth.near`."""
         centres = np.array([item.view.centre_in_enu_m for item in frames])
-        returns = returns_near(self.tiles, centres, self.max_range_m + self.margin_m)
-        return SurveyNear.of(returns, self.tiles.from_above, self.max_range_m)
+        returns = self.returns.near(centres, self.max_range_m + self.margin_m)
+        return SurveyNear.of(returns, self.from_above, self.max_range_m)
 
 
 @dataclass(frozen=True, slots=True)

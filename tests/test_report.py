@@ -35,6 +35,7 @@ from pipeline.reporting.tables import (
     checkpoint_table,
     cloud_table,
     control_table,
+    m3c2_table,
 )
 from pipeline.reporting.verdict import good_lines, headline
 from pipeline.reporting.words import number
@@ -97,7 +98,10 @@ def metrics() -> dict[str, Any]:
             "tolerances_m": [0.1, 0.2], "accuracy": [0.5, 0.8], "completeness": [0.3, 0.6], "f1": [0.375, 0.69],
             "n_points": 1000, "n_reference": 5000,
         },
-        "m3c2_ep": None,
+        "m3c2_ep": {
+            "n": 100, "median_m": -0.01, "mean_m": 0.0, "rms_m": 0.05, "lod95_median_m": 0.1, "significant_share": 0.05,
+            "within_lod_share": 0.95, "radius_m": 0.5, "normals": "reference",
+        },
         "without_control": {"methods": methods, "calibration": None, "map": None, "cloud": None},
         "truth": {
             "kind": "tiles", "correspondence": "sparse", "max_range_m": 100.0, "n_matches": 1200,
@@ -415,9 +419,12 @@ def test_tables_with_and_without_control_points_stand_beside_each_other() -> Non
     assert control.rows[-1] == ("All", "20", "12.0", "1.50")
     assert cloud is not None
     assert cloud.rows[0] == ("0.1 m", "50.0 %", "30.0 %", "37.5 %")
-    for table in (checked, control, cloud):
+    distances = m3c2_table(found["m3c2_ep"])
+    assert distances is not None
+    assert distances.rows[1] == ("Median distance (m)", "-0.010")
+    for table in (checked, control, cloud, distances):
         assert {len(row) for row in table.rows} == {len(table.head)}
-    assert (checkpoint_table(None), control_table(None), cloud_table(None)) == (None, None, None)
+    assert {checkpoint_table(None), control_table(None), cloud_table(None), m3c2_table(None)} == {None}
 
 
 def test_figures_show_what_was_measured() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pipeline.reporting.figure import Figure
+from pipeline.reporting.figure import LEGEND_ABOVE, MARGIN_OF_LEGEND, Figure
 from pipeline.reporting.palette import colours, in_order, label
 
 # A bin with fewer pixels tells nothing of its mean error.
@@ -33,12 +33,20 @@ def _binned(methods: Mapping[str, Any], key: str, title: str, axis: str) -> Figu
     traces = list(_bin_traces(methods, key))
     if not traces:
         return None
+    spans = [_span(one) for one in next(iter(methods.values()))[key]]
     layout = {
-        "xaxis": {"title": {"text": axis}},
+        "xaxis": {
+            "title": {"text": axis},
+            "type": "category",
+            "categoryorder": "array",
+            "categoryarray": spans,
+            "anchor": "y2",
+        },
         "yaxis": {"title": {"text": _RELATIVE}, "rangemode": "tozero", "domain": [0.36, 1.0]},
         "yaxis2": {"title": {"text": "Pixels (1)"}, "domain": [0.0, 0.26], "rangemode": "tozero"},
         "barmode": "group",
-        "legend": {"orientation": "h", "y": 1.12},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = (
         "Mean relative error of the pixels in each bin that every method keeps, and below how many these are; "
@@ -58,10 +66,10 @@ def _bin_traces(methods: Mapping[str, Any], key: str) -> Iterator[dict[str, Any]
                 "type": "scatter",
                 "mode": "lines+markers",
                 "name": label(name),
-                "x": [_middle(one) for one in full],
+                "x": [_span(one) for one in full],
                 "y": [one["common"]["abs_rel"] for one in full],
-                "customdata": [[_span(one), one["common"]["n"]] for one in full],
-                "hovertemplate": "%{customdata[0]}: %{y:.4f} (%{customdata[1]:,} pixels)",
+                "customdata": [one["common"]["n"] for one in full],
+                "hovertemplate": "%{x}: %{y:.4f} (%{customdata:,} pixels)",
                 "line": {"color": shades[name], "width": 2},
                 "marker": {"size": 7},
             }
@@ -70,8 +78,8 @@ def _bin_traces(methods: Mapping[str, Any], key: str) -> Iterator[dict[str, Any]
             yield {
                 "type": "bar",
                 "name": "Pixels",
-                "x": [_middle(one) for one in bins],
-                "y": [one["common"]["n"] for one in bins],
+                "x": [_span(one) for one in bins if one["common"]["n"]],
+                "y": [one["common"]["n"] for one in bins if one["common"]["n"]],
                 "yaxis": "y2",
                 "showlegend": False,
                 "marker": {"color": "#8f9aa3"},
@@ -79,12 +87,8 @@ def _bin_traces(methods: Mapping[str, Any], key: str) -> Iterator[dict[str, Any]
             }
 
 
-def _middle(one: Mapping[str, Any]) -> float:
-    return float(one["from"] if one["to"] is None else (one["from"] + one["to"]) / 2)
-
-
 def _span(one: Mapping[str, Any]) -> str:
-    return f"above {one['from']:g}" if one["to"] is None else f"{one['from']:g} to {one['to']:g}"
+    return f"over {one['from']:g}" if one["to"] is None else f"{one['from']:g} to {one['to']:g}"
 
 
 def _frames(methods: Mapping[str, Any]) -> Figure | None:
@@ -114,7 +118,8 @@ def _frames(methods: Mapping[str, Any]) -> Figure | None:
     layout = {
         "xaxis": {"title": {"text": "Frame (name)"}, "type": "category", "tickangle": -45, "automargin": True},
         "yaxis": {"title": {"text": _RELATIVE}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "y": 1.12},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = "Mean relative error of each frame on the pixels that every method keeps; look at those that stand out."
     return Figure("by-frame", "Error by frame", caption, tuple(traces), layout)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.reporting.figure import Figure
+from pipeline.reporting.figure import LEGEND_ABOVE, MARGIN_OF_LEGEND, Figure
 from pipeline.reporting.palette import QUIET, colours
 
 _STRAIGHT = {"dash": "dash", "color": QUIET, "width": 1.5}
@@ -43,7 +43,8 @@ def _shares(calibration: Mapping[str, Any]) -> Figure | None:
     layout = {
         "xaxis": {"title": {"text": "Nominal share of errors within the bound (1)"}, "range": [0.0, 1.0]},
         "yaxis": {"title": {"text": "Observed share (1)"}, "range": [0.0, 1.02]},
-        "legend": {"orientation": "h", "y": 1.12},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = (
         "If the sigmas are honest, a share p of the errors lies within the bound that should hold a share p. Below the "
@@ -98,7 +99,8 @@ def _by_sigma(calibration: Mapping[str, Any]) -> Figure | None:
     layout = {
         "xaxis": {"title": {"text": "Predicted relative error, rms (1)"}, "type": "log", "range": span, "dtick": "D1"},
         "yaxis": {"title": {"text": "Observed relative error, rms (1)"}, "type": "log", "range": span, "dtick": "D1"},
-        "legend": {"orientation": "h", "y": 1.12},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = (
         "Depths in bins of their predicted relative sigma: what was foretold, and what came. Above the dashed line "

@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+# A legend above the axes, and room for two rows of it below the buttons.
+LEGEND_ABOVE = {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"}
+MARGIN_OF_LEGEND = {"t": 76}
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:

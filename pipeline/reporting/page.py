@@ -34,6 +34,7 @@ from pipeline.reporting.tables import (
     configuration_table,
     control_table,
     frame_table,
+    m3c2_table,
     provenance_table,
     stage_table,
 )
@@ -121,6 +122,7 @@ def _accuracy(run: RunData) -> Section:
         checkpoint_table(metrics.get("checkpoints")),
         control_table(metrics.get("control_points")),
         cloud_table(metrics.get("cloud")),
+        m3c2_table(metrics.get("m3c2_ep")),
     )
     return Section(
         "accuracy",

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.flight import column
 from pipeline.reporting.counts import pair_rules, rule_of
-from pipeline.reporting.figure import Figure
+from pipeline.reporting.figure import LEGEND_ABOVE, MARGIN_OF_LEGEND, Figure
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import BAD, GOOD
 from pipeline.reporting.thin import evenly
@@ -66,7 +66,8 @@ def _candidates(run: RunData) -> Figure:
     layout = {
         "xaxis": {"title": {"text": "Baseline (m)"}, "rangemode": "tozero"},
         "yaxis": {"title": {"text": "Angle between the optical axes (deg)"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "y": 1.12},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = "Every candidate pair: how far apart the cameras stood, and how far their axes were turned."
     return Figure("candidates", "Candidate pairs", caption, tuple(traces), layout)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pipeline.reporting.figure import Figure
+from pipeline.reporting.figure import LEGEND_ABOVE, MARGIN_OF_LEGEND, Figure
 from pipeline.reporting.palette import BAD, TAKES
 
 
@@ -27,7 +27,8 @@ def _figure(kind: str, rows: Sequence[Mapping[str, Any]], sensitivity: Mapping[s
     layout = {
         "xaxis": {"title": {"text": f"Injected {words} error ({rows[0]['unit']})"}},
         "yaxis": {"title": {"text": f"AbsRel beside {sensitivity['reference']} (1)"}, "type": "log"},
-        "legend": {"orientation": "h", "y": 1.14},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = (
         "Solid: the pose with the error as it is. Dotted: after the pair was refined. Rings: the epipole lies inside "

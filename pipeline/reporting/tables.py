@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import in_order, label
-from pipeline.reporting.words import MISSING, interval, number, share, signed
+from pipeline.reporting.words import MISSING, number, share, signed
 
 # The paper's rows in the paper's order: metric, words, whether less is better.
 METRICS = (
@@ -78,7 +78,7 @@ def _paper_table(methods: Mapping[str, Any], which: str, caption: str, untrained
         if len(judged) > 1:
             best = told[(min if less else max)(judged, key=lambda name: judged[name])]
             strong |= {(len(rows), 1 + i) for i, name in enumerate(methods) if name in judged and told[name] == best}
-        cells = (told[name] + interval(bounds[name]) for name in methods)
+        cells = (told[name] + _bounds(bounds[name], key) for name in methods)
         rows.append((f"{words} {'↓' if less else '↑'}", *cells))
     rows.append(("Pixels", *(number(entry[which]["n"]) for entry in methods.values())))
     if which == "all":
@@ -93,6 +93,10 @@ def _paper_table(methods: Mapping[str, Any], which: str, caption: str, untrained
 
 def _told(value: float | None, key: str) -> str:
     return f"{value:.4f}" if value is not None and key.startswith("delta") else number(value)
+
+
+def _bounds(bounds: Sequence[float] | None, key: str) -> str:
+    return f" [{_told(bounds[0], key)}, {_told(bounds[1], key)}]" if bounds else ""
 
 
 def checkpoint_table(checkpoints: Mapping[str, Any] | None) -> Table | None:
@@ -141,6 +145,22 @@ def cloud_table(cloud: Mapping[str, Any] | None) -> Table | None:
     rows = tuple((f"{t:g} m", share(a), share(c), share(f)) for t, a, c, f in columns)
     note = f"{number(cloud['n_points'])} points against {number(cloud['n_reference'])} of the reference."
     return Table("Points against the reference cloud", ("Tolerance", "Accuracy", "Completeness", "F1"), rows, note)
+
+
+def m3c2_table(found: Mapping[str, Any] | None) -> Table | None:
+    """Distances between the points and the reference along its normals, beside what could be told from zero."""
+    if not found:
+        return None
+    rows = (
+        ("Core points (1)", number(found["n"])),
+        ("Median distance (m)", signed(found["median_m"])),
+        ("Mean distance (m)", signed(found["mean_m"])),
+        ("RMS distance (m)", number(found["rms_m"])),
+        ("Level of detection at 95 %, median (m)", number(found["lod95_median_m"])),
+        ("Within their level of detection", share(found["within_lod_share"])),
+    )
+    note = "If the covariances are honest and nothing has changed, 95 % lie within their level of detection."
+    return Table("Points against the reference, M3C2-EP", ("Measure", "Value"), rows, note)
 
 
 def frame_table(run: RunData) -> Table | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.reporting.figure import Figure
+from pipeline.reporting.figure import LEGEND_ABOVE, MARGIN_OF_LEGEND, Figure
 from pipeline.reporting.palette import colours
 
 
@@ -47,7 +47,8 @@ def figures(records: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
             "showgrid": False,
         },
         "barmode": "group",
-        "legend": {"orientation": "h", "y": 1.14},
+        "legend": LEGEND_ABOVE,
+        "margin": MARGIN_OF_LEGEND,
     }
     caption = "Wall time and peak memory of each stage's last run; stages that were up to date kept theirs."
     return [Figure("timings", "Time and memory", caption, traces, layout, 360)]

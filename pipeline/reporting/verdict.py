@@ -154,7 +154,8 @@ def _truth_line(good: Mapping[str, Any]) -> Iterator[Line]:
     truth = good["truth"]
     if truth:
         met = f"{number(truth['n_with_reference'])} of {number(truth['n_matches'])} matches with a reference"
-        yield Line("Against", f"{truth['kind']} up to {truth['max_range_m']:g} m, {truth['correspondence']}; {met}")
+        kind = {"tiles": "LiDAR tiles", "sweeps": "the flight's own LiDAR sweeps"}.get(truth["kind"], truth["kind"])
+        yield Line("Against", f"{kind} up to {truth['max_range_m']:g} m, {truth['correspondence']}; {met}")
 
 
 def _comparison(good: Mapping[str, Any]) -> Iterator[Line]:

@@ -25,7 +25,7 @@ WITHIN_TOLERANCE = {1: 0.10, 2: 0.05}
 BIN_TIMES, BIN_LEAST = 1.5, 100
 # Share of depths masked, of matches without a reference, of pixels outside the common ones that is told.
 MASKED_SHARE, UNSEEN_SHARE, UNCOMMON_SHARE = 0.3, 0.3, 0.5
-# ASPRS Positional Accuracy Standards, edition 2 (2023), section 7.12: least number of checkpoints.
+# ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2 (2023): least number of checkpoints.
 CHECKPOINTS = 30
 
 Numbers = Mapping[str, Any]

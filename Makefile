@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= runs/$(notdir $(basename $(WORKFLOW)))
 
-.PHONY: help example run test fuzz lint bench bench-poses bench-logs pictures clean
+.PHONY: help example run test fuzz lint bench bench-poses bench-logs pictures results clean
 help:
 	@echo "make example                 the built-in flight, from photos to scored points, in runs/example"
 	@echo "make run WORKFLOW=file.toml  a flight of yours, in runs/NAME (OUT=folder to choose)"
@@ -15,7 +15,8 @@ help:
 	@echo "make bench-logs              every kind of log against the stills, and big logs' speed and memory"
 	@echo "make fuzz                    10,000 damaged copies of a real file for every reader"
 	@echo "make pictures                the pictures of the README, from runs/example"
-	@echo "make clean                   removes runs/, example/ and .venv"
+	@echo "make results                 the README's tables and pictures, from the example flight and the room"
+	@echo "make clean                   removes runs/, example/, room/ and .venv"
 
 # Dependencies are installed only when what names them changes; sources are used in place.
 $(READY): pyproject.toml constraints.txt
@@ -80,5 +81,16 @@ bench-logs: $(READY) example
 pictures: $(READY)
 	$(BIN)/python docs/pictures.py runs/example docs
 
+room/workflow.toml: | $(READY)
+	rm -rf room
+	$(BIN)/epitransfer example room --indoor
+
+# What the README says of accuracy, from the flight and the room; the page is looked at where there is a chromium.
+results: $(READY) example room/workflow.toml
+	$(MAKE) --no-print-directory run WORKFLOW=room/workflow.toml OUT=runs/room
+	$(BIN)/python docs/results.py README.md "Example flight=runs/example" "Room with motion capture=runs/room"
+	$(BIN)/python docs/pictures.py runs/example docs
+	! command -v chromium >/dev/null || $(BIN)/python benchmarks/report_browser.py runs/example --pictures docs/report
+
 clean:
-	rm -rf runs example $(VENV)
+	rm -rf runs example room $(VENV)

@@ -33,7 +33,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "report": (
         "stages.stage_command",
         "report",
-        "What was flown, what came out, how good, what to distrust: a page.",
+        "One page: what came out, how good, and what to distrust.",
     ),
     "export": ("stages.export", "command", "Points in another format: laz, las, ply, gpkg, csv, parquet."),
     "example": ("stages.example", "command", "Write a small synthetic flight with its truth."),

@@ -17,6 +17,9 @@ from stages.options import Device, Jobs, Scheduler, Set, on_device
 from stages.registry import MODELS, ON_REQUEST, STAGES
 from stages.workflow import chosen_stages, execute
 
+# Whose words end a run, where they are among its stages.
+_TELLING = ("score", "report")
+
 
 def command(
     workflow: Annotated[Path | None, typer.Argument(help="Workflow file (TOML).")] = None,
@@ -53,7 +56,9 @@ def command(
     if as_json:
         typer.echo(json.dumps({"run": str(folder.root), "stages": {k: v["summary"] for k, v in records.items()}}))
     else:
-        typer.echo(f"{folder.root}: " + (list(records.values())[-1]["summary"] if records else "nothing to do"))
+        told = [records[name]["summary"] for name in _TELLING if name in records]
+        told = told or [record["summary"] for record in records.values()][-1:] or ["nothing to do"]
+        typer.echo(f"{folder.root}: {'; '.join(told)}")
 
 
 def _sources(workflow: Path | None, ingest: Mapping[str, Any], lidar: str | None) -> tuple[str, Sections]:

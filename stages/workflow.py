@@ -115,10 +115,10 @@ def execute(
             record = folder.record(name)
             if record and name != forced and staleness(stage, folder, configuration).status == "fresh":
                 folder.record_path(name).touch()
-                reporter.say(f"{name:<7}up to date: {record['summary']}")
+                reporter.say(f"{name:<12}up to date: {record['summary']}")
             else:
                 record = run_stage(stage, folder, configuration, executor, reporter)
-                reporter.say(f"{name:<7}{record['summary']} ({record['seconds']:.1f} s)")
+                reporter.say(f"{name:<12}{record['summary']} ({record['seconds']:.1f} s)")
             records[name] = record
             if name == "ingest":
                 _foresee(configuration, names, record["facts"])

@@ -17,7 +17,7 @@ from pipeline.simulation.render import CAMERA
 # The example's camera at a third of its size: the same lens, a flight in seconds.
 SMALL = CAMERA.scaled(480, 360)
 PROGRAM = (sys.executable, "-c", "from stages.app import main; main()")
-STAGES = ("ingest", "pair", "match", "refine", "depth", "fuse", "score")
+STAGES = ("ingest", "pair", "match", "refine", "depth", "fuse", "score", "report")
 
 
 def write_small_flight(folder: Path, frames: int = 6, camera: Camera = SMALL) -> Path:
@@ -37,11 +37,11 @@ def epitransfer(
 
 
 def outputs(run: Path) -> dict[str, str]:
-    """Digest of every file of a run that the contract promises, but the manifest, which tells times and places."""
+    """Digest of every file of a run that the contract promises, but manifest and report, which tell its time."""
     return {
         path.relative_to(run).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(run.rglob("*"))
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(run).parts)
+        if path.is_file() and not any(part.startswith((".", "report")) for part in path.relative_to(run).parts)
         and path.name not in {"manifest.json", "workflow.toml"}
     }  # fmt: skip
 

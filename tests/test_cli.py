@@ -274,7 +274,7 @@ def test_results_go_to_stdout_and_the_rest_to_stderr(
     assert out.startswith(f"{run}: AbsRel epitransfer ")
     assert len(err.splitlines()) == len(STAGES)
     code, out, err = spoken(capsys, *given, "--json", "--from", "depth")
-    assert set(json.loads(out)["stages"]) == {"depth", "fuse", "score"}
+    assert set(json.loads(out)["stages"]) == {"depth", "fuse", "score", "report"}
     code, out, err = spoken(capsys, "fuse", run, "--jobs", "1")
     assert code == 0
     assert "points in" in out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,6 +58,11 @@ class FakeContext:
     def output(self, name: str) -> Path:
         (self.folder / "out" / name).mkdir(parents=True, exist_ok=True)
         return self.folder / "out" / name
+
+    @property
+    def scratch(self) -> Path:
+        # Made anew for every run, as the engine does.
+        return Path(tempfile.mkdtemp(dir=self.folder))
 
     def setting(self, key: str) -> Any:
         assert key in STAGE.reads

@@ -3,7 +3,7 @@
 # that read it and what follows. A stage whose inputs came out the same after all is skipped by its key. Exit code 8 (done,
 # but too many items failed) stops no stage; `run` looks at all of them at the end.
 SECTIONS := $(shell sed -n 's/^ *\[\([a-z]*\)\].*/\1/p' $(WORKFLOW))
-ORDER := $(foreach stage,ingest pair match refine depth fuse score,$(filter $(stage),$(SECTIONS)))
+ORDER := $(foreach stage,ingest pair match refine depth fuse score sensitivity report,$(filter $(stage),$(SECTIONS)))
 RECORDS := $(ORDER:%=$(OUT)/.stages/%.json)
 SLICES := $(ORDER:%=$(OUT)/.slices/%.json)
 

@@ -74,6 +74,16 @@ methods = ["epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"]
 [score]
 lidar = "{lidar}"
 """
+_CONTROL = """\
+control_points = "gcp_list.txt"
+control_height_datum = "navd88"
+"""
+# A translation takes three points.
+_FEWEST_CONTROL = 3
+_REPORT = """\
+
+[report]
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,11 +298,12 @@ def _write(flight: _Flight, camera: Camera) -> tuple[int, int]:
     returns = survey(site)
     write_tiles(site, returns, flight.folder / "lidar")
     observations = observe(site, camera, true_poses)
+    control = _CONTROL if len({seen.point for seen in observations}) >= _FEWEST_CONTROL else ""
     texts = {
         "gcp_list.txt": gcp_list(site, observations),
         "truth/poses.csv": poses_csv(site, true_poses),
         "truth/site.json": site_json(site, camera, CONSUMER_DRONE, true_poses, observations),
-        "workflow.toml": _WORKFLOW + _STAGES.format(lidar="lidar/*.laz"),
+        "workflow.toml": _WORKFLOW + _STAGES.format(lidar="lidar/*.laz") + control + _REPORT,
         CAMERA_FILE: camera_yaml(camera),
         **workflows(_STAGES.format(lidar="lidar/*.laz")),
     }

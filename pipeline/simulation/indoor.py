@@ -88,6 +88,8 @@ tile_m = 20
 
 [score]
 max_range_m = 15.0
+
+[report]
 """
 
 

@@ -150,7 +150,8 @@ def write_run(root: Path, tiles: Path) -> None:
         for pose in poses
     ]  # fmt: skip
     camera = {"camera_id": "c", "model": CAMERA.model, "width": CAMERA.width, "height": CAMERA.height,
-              "fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy, "distortion": CAMERA.distortion, "source": ""}  # fmt: skip
+              "fx": CAMERA.fx, "fy": CAMERA.fy, "cx": CAMERA.cx, "cy": CAMERA.cy,
+              "distortion": CAMERA.distortion, "source": ""}  # fmt: skip
     covariance = np.diag([1e-6] * 3 + [1e-4] * 3).ravel().tolist()
     tables = {
         "frames": FRAMES.from_rows(frames),
@@ -242,7 +243,8 @@ def main() -> None:
         )
         print(
             f"ratio    {scored.wall_s / reading.wall_s:6.2f} (the stage itself "
-            f"{record['seconds'] / reading.wall_s:.2f}); {facts['matches_with_reference']:,} of {facts['matches']:,} with a reference; {record['summary']}"
+            f"{record['seconds'] / reading.wall_s:.2f}); {facts['matches_with_reference']:,} of {facts['matches']:,} "
+            f"with a reference; {record['summary']}"
         )
 
 

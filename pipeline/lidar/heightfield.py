@@ -10,6 +10,8 @@ from scipy import ndimage
 from pipeline.geometry.arrays import Floats
 
 _DENSITY_CELL_M = 2.0
+# Cells that are counted in a table; a few returns far apart span more than fit one.
+_MOST_COUNTED = 10_000_000
 # Ground cells this large hold some two returns, so that few inside a surface are empty.
 _CELL_SPACINGS = 1.5
 _SMALLEST_CELL_M, _LARGEST_CELL_M = 0.1, 3.0
@@ -28,7 +30,12 @@ def return_spacing_m(points_in_enu_m: Floats) -> float:
     """
     cells = np.floor(points_in_enu_m[:, :2] / _DENSITY_CELL_M).astype(np.int64)
     cells -= cells.min(axis=0)
-    _, counts = np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1], return_counts=True)
+    flat = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    if flat.max() < _MOST_COUNTED:
+        counts = np.bincount(flat)
+        counts = counts[counts > 0]
+    else:
+        _, counts = np.unique(flat, return_counts=True)
     return float(_DENSITY_CELL_M / np.sqrt(np.median(counts)))
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.arrays import AnyArray, Bools, Floats
+from pipeline.geometry.arrays import AnyArray, Bools, Floats, Ints
+from pipeline.geometry.cameras import Camera
 from pipeline.lidar.visibility import VisibleReturns
 
 # Returns a plane is fitted to: three unknowns, and enough over to see that it is no plane.
@@ -50,6 +52,29 @@ class Reference:
         return Reference(self.depth_m[rows], self.spread_m[rows], self.slope[rows], self.valid[rows])
 
 
+def reference_through(camera: Camera, pixels: Floats, visible: VisibleReturns) -> Reference:
+    """Reference depths at pixels of a camera from the visible returns around them.
+
+    As `reference_depth`, with only the returns that are used brought to ideal pixels.
+
+    Args:
+        camera: Whose pixels they are.
+        pixels: (n, 2) u, v of the image as given.
+        visible: The visible returns.
+
+    Returns:
+        One depth per pixel.
+    """
+    focal = camera.focal_px
+
+    def ideal(rows: Ints) -> Floats:
+        used, back = np.unique(rows, return_inverse=True)
+        out: Floats = (focal * camera.rays(visible.pixels[used])[:, :2])[back.reshape(rows.shape)]
+        return out
+
+    return _fitted(pixels, focal * camera.rays(pixels)[:, :2], visible, ideal)
+
+
 def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal_visible: Floats) -> Reference:
     """Reference depths at pixels from the visible returns around them.
 
@@ -64,18 +89,29 @@ def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturn
     Returns:
         One depth per pixel.
     """
+    return _fitted(pixels, ideal_pixels, visible, lambda rows: ideal_visible[rows])
+
+
+def _fitted(
+    pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal: Callable[[Ints], Floats]
+) -> Reference:
+    """The planes; `ideal` gives the ideal pixels of some visible returns."""
     count = len(pixels)
     depth, spread, slope = np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan)
     ok = np.isfinite(pixels).all(axis=1) & np.isfinite(ideal_pixels).all(axis=1)
     rows = np.flatnonzero(ok)
     if len(visible.depth_m) < NEIGHBOURS or not len(rows):
         return Reference.none(count)
-    distance, near = (np.asarray(found) for found in cKDTree(visible.pixels).query(pixels[rows], k=NEIGHBOURS))
+    # A tree asked so little is not worth balancing.
+    tree = cKDTree(visible.pixels, balanced_tree=False, compact_nodes=False)
+    distance, near = (np.asarray(found) for found in tree.query(pixels[rows], k=NEIGHBOURS))
     reach = np.maximum(_REACH_FOOTPRINTS * np.median(visible.footprint_px[near], axis=1), _LEAST_REACH_PX)
     close = distance[:, -1] <= reach
     rows, near = rows[close], near[close]
+    if not len(rows):
+        return Reference.none(count)
     inverse, gradient, residual, sound = plane_at_centre(
-        ideal_visible[near] - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
+        ideal(near) - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
     )
     sound &= (inverse > 0.0) & (residual <= LARGEST_SPREAD * inverse)
     rows, inverse, residual = rows[sound], inverse[sound], residual[sound]

@@ -14,6 +14,7 @@ Under a ceiling or a crown that was scanned from below nothing stands on columns
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -21,12 +22,15 @@ from scipy import ndimage
 
 from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.geometry.cameras import Camera
+from pipeline.lidar.blocks import Blocks, widest_slope
 from pipeline.lidar.heightfield import HeightField
 
 # What stands within this many cells in front of a return is taken as the return's own surface.
 _OWN_CELLS = 1.5
 # The line of sight may pass this far below a top: the noise of LiDAR heights.
 _CLEARANCE_M = 0.1
+# Points projected together, and rays of the horizon followed together: few enough for the processor's cache.
+_POINTS_AT_ONCE, _RAYS_AT_ONCE = 8192, 64
 # Bins of the z-buffer in spacings of the returns as the camera sees them.
 _BIN_SPACINGS = 1.0
 _SMALLEST_BIN_PX = 2.0
@@ -77,7 +81,12 @@ class VisibleReturns:
 
 
 def visible_returns(
-    view: View, points_in_enu_m: Floats, field: HeightField | None, spacing_m: float, max_range_m: float
+    view: View,
+    points_in_enu_m: Floats,
+    field: HeightField | None,
+    spacing_m: float,
+    max_range_m: float,
+    blocks: Blocks | None = None,
 ) -> VisibleReturns:
     """The returns that a camera sees within a range.
 
@@ -88,8 +97,9 @@ def visible_returns(
             not from above.
         spacing_m: Between neighbouring returns, m.
         max_range_m: Largest Euclidean distance from the camera, m.
+        blocks: Of the returns, to be quick where a camera sees few of them; they change nothing else.
     """
-    index, pixels, depth = in_image(view, points_in_enu_m, max_range_m)
+    index, pixels, depth = in_image(view, points_in_enu_m, max_range_m, blocks)
     if field is not None:
         seen = ~behind_columns(view.centre_in_enu_m, points_in_enu_m[index], field, max_range_m)
         index, pixels, depth = index[seen], pixels[seen], depth[seen]
@@ -98,25 +108,51 @@ def visible_returns(
     return VisibleReturns(index[seen], pixels[seen], depth[seen], footprint[seen])
 
 
-def in_image(view: View, points_in_enu_m: Floats, max_range_m: float) -> tuple[Ints, Floats, Floats]:
+def in_image(
+    view: View, points_in_enu_m: Floats, max_range_m: float, blocks: Blocks | None = None
+) -> tuple[Ints, Floats, Floats]:
     """Which points fall into the image, were nothing in the way.
 
     Args:
         view: The camera.
         points_in_enu_m: (n, 3) ENU, m.
         max_range_m: Largest Euclidean distance, m.
+        blocks: Of the points.
 
     Returns:
         Rows (m,), pixels (m, 2) and depths (m,) in m of those in the image, before the camera and within range.
     """
-    camera = view.camera
-    offset = points_in_enu_m - view.centre_in_enu_m
-    index = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= max_range_m**2)
-    index = index[offset[index] @ view.rotation_enu_from_cam[:, 2] > 0.0]
-    in_cam = offset[index] @ view.rotation_enu_from_cam
-    pixels = camera.project(in_cam)
-    inside = np.flatnonzero(camera.holds(pixels))
-    return index[inside], pixels[inside], in_cam[inside, 2]
+    slope = widest_slope(view.camera)
+    runs = [slice(0, len(points_in_enu_m))]
+    if blocks is not None:
+        axis = view.rotation_enu_from_cam[:, 2]
+        runs = blocks.runs(blocks.before(view.centre_in_enu_m, axis, slope, max_range_m))
+    parts = [
+        _in_image(view, points_in_enu_m, slice(start, min(start + _POINTS_AT_ONCE, run.stop)), slope, max_range_m)
+        for run in runs
+        for start in range(run.start, run.stop, _POINTS_AT_ONCE)
+    ]
+    if not parts:
+        return np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0)
+    index, pixels, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return index, pixels, depth
+
+
+def _in_image(
+    view: View, points_in_enu_m: Floats, rows: slice, slope: float, max_range_m: float
+) -> tuple[Ints, Floats, Floats]:
+    """Those of some rows; what is further from the axis than a slope is not projected."""
+    offset = points_in_enu_m[rows] - view.centre_in_enu_m
+    near = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= max_range_m**2)
+    in_cam = offset[near] @ view.rotation_enu_from_cam
+    before = in_cam[:, 2] > 0.0
+    if np.isfinite(slope):
+        before &= in_cam[:, 0] ** 2 + in_cam[:, 1] ** 2 <= (slope * in_cam[:, 2]) ** 2
+    if not before.all():
+        in_cam, near = in_cam[before], near[before]
+    pixels = view.camera.project(in_cam)
+    inside = np.flatnonzero(view.camera.holds(pixels))
+    return near[inside] + rows.start, pixels[inside], in_cam[inside, 2]
 
 
 def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range_m: float) -> Bools:
@@ -143,17 +179,48 @@ def behind_columns(centre: Floats, points: Floats, field: HeightField, max_range
     step = 0.5 * field.cell_m / reach
     first = np.floor(azimuth.min() / step)
     ray = (azimuth / step - first).astype(np.int64)
-    angles = (first + np.arange(int(ray.max()) + 1) + 0.5) * step + middle - np.pi
-    distance = (np.arange(int(reach / (0.5 * field.cell_m)) + 1) + 1.0) * 0.5 * field.cell_m
-    tops = field.at(
-        centre[0] + distance[None, :] * np.cos(angles)[:, None], centre[1] + distance[None, :] * np.sin(angles)[:, None]
-    )
-    slope = (tops - centre[2] - _CLEARANCE_M) / distance
-    horizon = np.maximum.accumulate(slope, axis=1)
-    last = np.floor((ground - _OWN_CELLS * field.cell_m) / (0.5 * field.cell_m)).astype(np.int64) - 1
-    met = np.where(last >= 0, horizon[ray, np.maximum(last, 0)], -np.inf)
+    # Samples before the point's own surface.
+    before = np.floor((ground - _OWN_CELLS * field.cell_m) / (0.5 * field.cell_m)).astype(np.int64)
+    before = np.clip(before, 0, int(reach / (0.5 * field.cell_m)) + 1)
+    met = np.full(len(points), -np.inf)
+    rows = np.flatnonzero(before > 0)
+    rays, at = np.unique(ray[rows], return_inverse=True)
+    angles = (first + rays + 0.5) * step + middle - np.pi
+    met[rows] = _horizon(centre, field, angles, at, before[rows])
     hidden: Bools = offset[:, 2] < met * ground
     return hidden
+
+
+def _horizon(centre: Floats, field: HeightField, angles: Floats, ray: Ints, samples: Ints) -> Floats:
+    """The steepest slope that points meet on their rays.
+
+    Args:
+        centre: (3,) camera centre, ENU m.
+        field: The height field, sampled every half cell.
+        angles: (r,) azimuth of each ray, rad.
+        ray: (n,) which one a point lies on.
+        samples: (n,) how many samples lie before a point, at least one.
+
+    Returns:
+        (n,) rise over ground distance.
+    """
+    met = np.empty(len(ray))
+    order = np.argsort(ray, kind="stable")
+    starts = np.searchsorted(ray[order], np.arange(0, len(angles) + _RAYS_AT_ONCE, _RAYS_AT_ONCE))
+    for number, (low, high) in enumerate(pairwise(starts)):
+        rows = order[low:high]
+        some = slice(number * _RAYS_AT_ONCE, (number + 1) * _RAYS_AT_ONCE)
+        if not len(rows):
+            continue
+        distance = (np.arange(int(samples[rows].max())) + 1.0) * 0.5 * field.cell_m
+        tops = field.at(
+            centre[0] + distance[None, :] * np.cos(angles[some])[:, None],
+            centre[1] + distance[None, :] * np.sin(angles[some])[:, None],
+        )
+        slope = (tops - centre[2] - _CLEARANCE_M) / distance
+        horizon = np.maximum.accumulate(slope, axis=1)
+        met[rows] = horizon[ray[rows] - some.start, samples[rows] - 1]
+    return met
 
 
 def _passes_z_buffer(camera: Camera, pixels: Floats, depth: Floats, footprint: Floats) -> Bools:

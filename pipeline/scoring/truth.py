@@ -9,8 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.geometry.arrays import Floats
+from pipeline.lidar.blocks import Blocks
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
-from pipeline.lidar.reference import Reference, reference_depth
+from pipeline.lidar.reference import Reference, reference_through
 from pipeline.lidar.spacing import surface_spacing_m
 from pipeline.lidar.store import Store
 from pipeline.lidar.visibility import View, VisibleReturns, behind_columns, visible_returns
@@ -98,12 +99,14 @@ class SurveyNear:
         spacing_m: Between neighbouring ones.
         field: What stands there, if they are from above.
         max_range_m: As `Survey`.
+        blocks: Of the returns.
     """
 
     returns: Floats
     spacing_m: float
     field: HeightField | None
     max_range_m: float
+    blocks: Blocks
 
     @staticmethod
     def of(returns: Floats, from_above: bool, max_range_m: float) -> SurveyNear:
@@ -114,25 +117,26 @@ class SurveyNear:
             from_above: Whether they are a survey from the air.
             max_range_m: As `Survey`.
         """
+        blocks = Blocks.of(returns)
         if not len(returns):
-            return SurveyNear(returns, np.nan, None, max_range_m)
+            return SurveyNear(returns, np.nan, None, max_range_m, blocks)
         if not from_above:
-            return SurveyNear(returns, surface_spacing_m(returns), None, max_range_m)
+            return SurveyNear(returns, surface_spacing_m(returns), None, max_range_m, blocks)
         spacing = return_spacing_m(returns)
-        return SurveyNear(returns, spacing, HeightField.of(returns, spacing), max_range_m)
+        return SurveyNear(returns, spacing, HeightField.of(returns, spacing), max_range_m, blocks)
 
     def moved(self, translation_m: Floats) -> SurveyNear:
         """As `NearTruth.moved`."""
         if not np.any(translation_m):
             return self
         field = None if self.field is None else self.field.moved(translation_m)
-        return replace(self, returns=self.returns + translation_m, field=field)
+        return replace(self, returns=self.returns + translation_m, field=field, blocks=self.blocks.moved(translation_m))
 
     def seen_by(self, frame: FrameView) -> SurveySeen:
         """As `NearTruth.seen_by`."""
         if not len(self.returns):
             return SurveySeen(frame, self, VisibleReturns.none())
-        visible = visible_returns(frame.view, self.returns, self.field, self.spacing_m, self.max_range_m)
+        visible = visible_returns(frame.view, self.returns, self.field, self.spacing_m, self.max_range_m, self.blocks)
         return SurveySeen(frame, self, visible)
 
 
@@ -172,9 +176,8 @@ class SurveySeen:
         view, field, most = self.frame.view, self.near.field, self.near.max_range_m
         # The same feature is matched in several pairs: its reference is found once.
         distinct, back = np.unique(pixels, axis=0, return_inverse=True)
-        rays, focal = view.camera.rays(distinct), view.camera.focal_px
-        ideal = focal * view.camera.rays(self.visible.pixels)[:, :2]
-        found = reference_depth(distinct, focal * rays[:, :2], self.visible, ideal)
+        rays = view.camera.rays(distinct)
+        found = reference_through(view.camera, distinct, self.visible)
         valid = found.valid & (found.depth_m * np.linalg.norm(rays, axis=1) <= most)
         if field is not None:
             # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.

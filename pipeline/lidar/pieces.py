@@ -199,7 +199,7 @@ def _key(level: int, x: int, y: int, z: int) -> VoxelKey:
 def _wanted(chunk: laspy.ScaleAwarePointRecord, holds: Callable[[Floats, Floats], Bools], seen: Seen) -> Floats:
     x, y = np.asarray(chunk.x, np.float64), np.asarray(chunk.y, np.float64)
     rows = np.flatnonzero(holds(x, y))
-    points = np.stack([x[rows], y[rows], np.asarray(chunk.z[rows], np.float64)])
+    points = np.stack([x[rows], y[rows], np.asarray(chunk.z, np.float64)[rows]])
     classes, withheld = np.asarray(chunk.classification)[rows], np.asarray(chunk.withheld, np.bool_)[rows]
     seen.by_class += np.bincount(classes, minlength=_CLASSES)
     seen.withheld += int(np.count_nonzero(withheld))

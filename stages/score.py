@@ -163,12 +163,12 @@ def foresee(config: Config, setting: Callable[[str], Any], facts: Mapping[str, A
     BaselineSetting.find(config.baselines, config.models, setting("match.device"))
     if config.correspondence == "dense":
         weights_of(config.dense_matcher, setting("match.weights"))
-    if (named := _control(config)) is not None:
-        named.placed(facts, setting("ingest.geoid"))
     if config.depth_images is not None:
         find(config.depth_images, SUFFIXES)
     else:
         _tiles(config).foresee(facts)
+    if (named := _control(config)) is not None:
+        named.placed(facts, setting("ingest.geoid"))
 
 
 def sources(config: Config) -> tuple[Path | str, ...]:

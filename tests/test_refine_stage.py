@@ -347,8 +347,8 @@ def did(capsys: pytest.CaptureFixture[str], flight: Path, run: Path, *arguments:
 def test_another_mode_runs_what_follows_from_refine_and_jobs_do_not_matter(
     small_flight: Path, small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, follows = outputs(small_run), ["refine", "depth", "fuse", "score"]
-    assert STAGES[-4:] == tuple(follows)
+    before, follows = outputs(small_run), ["refine", "depth", "fuse", "score", "report"]
+    assert STAGES[-5:] == tuple(follows)
     usual = json.loads((small_run / "manifest.json").read_text())["stages"]["refine"]["config"]["mode"]["value"]
     mode = "flight" if usual == "pair" else "pair"
     given, made = ("--set", f"refine.mode={mode}", "--jobs"), {}

@@ -374,7 +374,7 @@ def test_same_seed_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_workflow_names_what_is_there(indoor: Summary, bag: dict[str, list[Any]]) -> None:
     workflow = tomllib.loads((indoor.directory / "workflow.toml").read_text())
-    assert list(workflow) == ["ingest", "pair", "match", "refine", "depth", "fuse", "score"]
+    assert list(workflow) == ["ingest", "pair", "match", "refine", "depth", "fuse", "score", "report"]
     ingest = workflow["ingest"]
     assert (indoor.directory / ingest["bags"]).is_dir()
     assert {ingest["pose_topic"], ingest["image_topic"]} <= bag.keys()

@@ -429,7 +429,7 @@ def test_control_points_agree_with_the_true_poses(made: Path) -> None:
 
 def test_the_workflow_names_what_is_there(made: Path) -> None:
     workflow = tomllib.loads((made / "workflow.toml").read_text())
-    assert list(workflow) == ["ingest", "pair", "match", "refine", "depth", "fuse", "score"]
+    assert list(workflow) == ["ingest", "pair", "match", "refine", "depth", "fuse", "score", "report"]
     assert len(list((made / workflow["ingest"]["photos"]).glob("*.JPG"))) == FRAMES
     assert len(list(made.glob(workflow["score"]["lidar"]))) == 2
     assert workflow["ingest"]["geoid"] == UNDULATION_M

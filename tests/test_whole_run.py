@@ -38,7 +38,10 @@ def test_a_run_holds_what_the_contract_says(small_run: Path) -> None:
 
 
 def test_every_table_of_a_run_is_of_its_schema(small_run: Path) -> None:
+    assert set(TABLES) > {"curves"}, "which only sensitivity makes"
     for name, schema in TABLES.items():
+        if name == "curves":
+            continue
         folder = {"pixels": small_run / "scores"}.get(name, small_run / name)
         files = sorted(folder.glob("*.parquet")) if folder.is_dir() else [small_run / f"{name}.parquet"]
         assert files
@@ -64,7 +67,9 @@ def test_its_figures_are_sane(small_run: Path) -> None:
     assert set(methods) == {"epitransfer", "dlt", "epitransfer-lateral", "epitransfer-vertical"}
     common = {name: found["common"] for name, found in methods.items()}
     assert len({found["n"] for found in common.values()}) == 1, "the same pixels for every method"
-    assert 0.005 < methods["epitransfer"]["all"]["abs_rel"] < 0.1
+    assert 0.001 < methods["epitransfer"]["all"]["abs_rel"] < 0.02
+    without = metrics["without_control"]["methods"]["epitransfer"]["all"]["abs_rel"]
+    assert methods["epitransfer"]["all"]["abs_rel"] < without < 0.1, "the flight as a whole is off"
     assert methods["epitransfer"]["all"]["abs_rel"] < methods["dlt"]["all"]["abs_rel"]
     assert methods["epitransfer"]["kept_share"] > 0.7
     assert 0.5 < metrics["calibration"]["within_1_sigma"] <= 1.0
@@ -143,12 +148,12 @@ def test_only_the_stages_that_read_a_changed_key_run_again(
     run = copied(small_run, tmp_path / "run")
     assert again(capsys, small_flight, run) == dict.fromkeys(STAGES, False)
     nearer = again(capsys, small_flight, run, "--set", "depth.max_range_m=40")
-    assert [stage for stage, did in nearer.items() if did] == ["depth", "fuse", "score"]
+    assert [stage for stage, did in nearer.items() if did] == ["depth", "fuse", "score", "report"]
     assert outputs(run) != outputs(small_run)
     coarser = again(capsys, small_flight, run, "--set", "depth.max_range_m=40", "--set", "fuse.voxel_m=1.0")
-    assert [stage for stage, did in coarser.items() if did] == ["fuse"]
+    assert [stage for stage, did in coarser.items() if did] == ["fuse", "score", "report"]
     back = again(capsys, small_flight, run)
-    assert [stage for stage, did in back.items() if did] == ["depth", "fuse", "score"]
+    assert [stage for stage, did in back.items() if did] == ["depth", "fuse", "score", "report"]
     assert outputs(run) == outputs(small_run), "back to where it was"
     assert leftovers(run) == []
 
@@ -198,9 +203,9 @@ def test_photos_that_moved_are_found_and_nothing_else_runs_again(
     assert command_line(["status", str(run), "--json"]) == 0, "status does not need the sources"
     assert json.loads(capsys.readouterr().out)["stages"]["ingest"]["status"] == "stale"
     did = again(capsys, moved, run)
-    assert [stage for stage, it in did.items() if it] == ["ingest"]
+    assert [stage for stage, it in did.items() if it] == ["ingest", "report"]
     coarser = again(capsys, moved, run, "--set", "fuse.voxel_m=1.0")
-    assert [stage for stage, it in coarser.items() if it] == ["fuse"]
+    assert [stage for stage, it in coarser.items() if it] == ["fuse", "score", "report"]
 
 
 # --- sources on the command line, exports ---
@@ -265,6 +270,9 @@ def test_two_cameras_in_one_flight(small_flight: Path, tmp_path: Path, capsys: p
     for n in (2, 4, 6):
         name = f"DJI_000{n}.JPG"
         shutil.copy(other / "photos" / name, flight / "photos" / name)
+    # The control points are those of photos of the first size.
+    recipe = flight / "workflow.toml"
+    recipe.write_text("".join(line for line in recipe.open() if not line.startswith("control_")))
     again(capsys, flight, tmp_path / "run")
     assert pq.read_metadata(tmp_path / "run" / "cameras.parquet").num_rows == 2
     depths = pq.read_table(tmp_path / "run" / "depths").to_pandas()

@@ -14,6 +14,7 @@ from pipeline.geometry.arrays import Floats
 from pipeline.scoring.around_control import AroundControl
 from pipeline.scoring.checkpoints import checkpoint_metrics, checkpoints, left_one_out
 from pipeline.scoring.frame_scores import Correction
+from pipeline.scoring.inputs import datum_of, is_local
 from pipeline.scoring.translation import solve_translation
 from pipeline.sources.control_places import marks_of
 from pipeline.sources.control_points import load_control_points
@@ -78,7 +79,10 @@ def control_of(context: Context, named: ControlNamed) -> Control:
         NothingLeftError: No row is of a photo of the flight.
         UsageError: The height datum is none.
     """
-    found = named.placed(context.facts("ingest"), context.setting("ingest.geoid"))
+    facts = context.facts("ingest")
+    if not is_local(facts):
+        datum_of(context.read("frames"))
+    found = named.placed(facts, context.setting("ingest.geoid"))
     frames, poses = context.read("frames"), context.read("poses")
     cameras = camera_by_frame(frames, cameras_of(context.read("refined_cameras")))
     images = dict(zip(column(frames, "frame_id"), column(frames, "image"), strict=True))

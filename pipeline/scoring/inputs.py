@@ -76,11 +76,9 @@ class TilesNamed:
             return LocalTiles(tuple(map(read_local_tile, found)))
         if is_local(facts):
             return LocalTiles(tuple(map(read_local_tile, expand(self.lidar))))
-        frames = context.read("frames")
-        datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
-        check_datums(datums)
+        datum = datum_of(context.read("frames"))
         tiles = tuple(read_tile(path, self.height_datum) for path in expand(self.lidar))
-        return LocalTiles(tiles, LocalFrame(**facts["origin"]), context.setting("ingest.geoid"), datums[0])
+        return LocalTiles(tiles, LocalFrame(**facts["origin"]), context.setting("ingest.geoid"), datum)
 
     def foresee(self, facts: Mapping[str, Any]) -> None:
         """Refuses what `local` would, before there are any depths."""
@@ -92,6 +90,17 @@ class TilesNamed:
             check_datums([facts["height_datum"]])
         for path in expand(self.lidar):
             read_local_tile(path) if is_local(facts) else read_tile(path, self.height_datum)
+
+
+def datum_of(frames: pa.Table) -> str:
+    """What the flight's heights are measured from.
+
+    Raises:
+        UndeterminedError: Several datums, or one that nothing ties to the ellipsoid.
+    """
+    datums = sorted(set(frames.filter(frames.column("usable")).column("height_datum").to_pylist()))
+    check_datums(datums)
+    return str(datums[0])
 
 
 def is_local(facts: Mapping[str, Any]) -> bool:

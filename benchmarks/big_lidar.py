@@ -32,7 +32,7 @@ from pipeline.geodesy.transform import to_enu
 from pipeline.geometry.arrays import Floats
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import enu_from_cam, quaternion_from_rotation
-from schemas import DEPTHS, FRAMES, PAIRS, POSES, REFINED_CAMERAS, RELATIVE_POSES
+from schemas import DEPTHS, FRAMES, PAIRS, POSE_COVARIANCES, POSES, REFINED_CAMERAS, RELATIVE_POSES
 
 ORIGIN, UNDULATION_M, COMPOUND = LocalFrame(37.5, -78.3, 120.0), -33.0, "EPSG:32617+5703"
 TILE_M, TILES = 200.0, (6, 4)
@@ -156,6 +156,7 @@ def write_run(root: Path, tiles: Path) -> None:
     tables = {
         "frames": FRAMES.from_rows(frames),
         "poses": POSES.from_rows({**pose, "cov": covariance, "refined": False} for pose in poses),
+        "pose_covariances": POSE_COVARIANCES.empty(),
         "refined_cameras": REFINED_CAMERAS.from_rows([camera]),
         "pairs": PAIRS.empty(),
         "relative_poses": RELATIVE_POSES.empty(),

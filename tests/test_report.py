@@ -599,3 +599,19 @@ def test_doubts_come_gravest_first(small: RunData, tmp_path: Path) -> None:
     ranks = [doubt.rank for doubt in doubts(run_of(small, tmp_path, **records), {**sound(), "how_good": None})]
     assert ranks == sorted(ranks, reverse=True)
     assert ranks[0] > ranks[-1]
+
+
+@pytest.mark.parametrize(("up_m", "told"), [(0.38, True), (0.02, False)])
+def test_points_are_delivered_where_the_poses_put_them(small: RunData, tmp_path: Path, up_m: float, told: bool) -> None:
+    found = sound()
+    found["how_good"]["shift"] = {
+        "translation_m": [0.0, 0.0, up_m],
+        "sigma_m": [0.01, 0.01, 0.02],
+        "checkpoints": None,
+        "abs_rel_without": 0.0117,
+    }
+    texts = [d.text for d in doubts(run_of(small, tmp_path), found) if d.rule == "shifted"]
+    assert bool(texts) == told
+    if told:
+        assert f"{up_m:+.2f} m up" in texts[0]
+        assert "refine.control_points" in texts[0]

@@ -22,7 +22,7 @@ def figures(metrics: Mapping[str, Any], untrained: frozenset[str]) -> list[Figur
     """
     methods = {name: metrics["methods"][name] for name in in_order(metrics["methods"]) if name not in untrained}
     found = [
-        _binned(methods, "by_range", "Error by range", "Range: depth of the reference (m)"),
+        _binned(methods, "by_range", "Error by range", "Range: distance from the camera (m)"),
         _binned(methods, "by_parallax", "Error by parallax", "Parallax: angle between the two rays (deg)"),
         _frames(methods),
     ]

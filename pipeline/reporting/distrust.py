@@ -5,6 +5,7 @@ Each rule is a function from the run and its numbers to sentences; its threshold
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from pipeline.engine.progress import counted
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import label
+from pipeline.reporting.words import number
 from pipeline.reporting.words import share as percent
 
 # Ranks.
@@ -25,6 +27,8 @@ WITHIN_TOLERANCE = {1: 0.10, 2: 0.05}
 BIN_TIMES, BIN_LEAST = 1.5, 100
 # Share of depths masked, of matches without a reference, of pixels outside the common ones that is told.
 MASKED_SHARE, UNSEEN_SHARE, UNCOMMON_SHARE = 0.3, 0.3, 0.5
+# A shift is told beyond this, and beyond so many of its sigmas.
+_SHIFT_M, _SHIFT_SIGMAS = 0.05, 3.0
 # ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2 (2023): least number of checkpoints.
 CHECKPOINTS = 30
 
@@ -123,6 +127,23 @@ def _checkpoints(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     elif checked["n"] < CHECKPOINTS:
         text = f"{counted(checked['n'], 'checkpoint')}, where ASPRS asks for {CHECKPOINTS} before an accuracy is stated"
         yield Doubt("checkpoints", MIND, text)
+
+
+def _shifted(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
+    """Points are delivered where the poses put them: what control points say is used to score, not to move them."""
+    del run
+    shift = (numbers["how_good"] or {}).get("shift")
+    if not shift:
+        return
+    far, sigma = math.hypot(*shift["translation_m"]), math.hypot(*shift["sigma_m"])
+    if far > max(_SHIFT_SIGMAS * sigma, _SHIFT_M):
+        east, north, up = shift["translation_m"]
+        text = (
+            f"The points lie {number(far)} m off the control points ({east:+.2f} m east, {north:+.2f} m north, "
+            f"{up:+.2f} m up); depths were scored with this taken out, the points are delivered with it: "
+            "refine.control_points moves them"
+        )
+        yield Doubt("shifted", MIND, text)
 
 
 def _left_out(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
@@ -300,6 +321,7 @@ RULES: Sequence[Callable[[RunData, Numbers], Iterator[Doubt]]] = (
     _bins,
     _few_common,
     _checkpoints,
+    _shifted,
     _masked,
     _coverage,
     _datum,

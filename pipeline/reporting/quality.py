@@ -24,6 +24,8 @@ def quality(run: RunData) -> dict[str, Any] | None:
     Returns:
         `truth`, `published`, `methods` (name, untrained, share kept, AbsRel and RMSE on the pixels all methods keep
         with their 95 % intervals), `map`, `checkpoints` and `calibration`; parts that metrics.json lacks are None.
+        Where control points moved the truth, `checkpoints` are those without that move, for points are delivered
+        without it; `shift` tells the move, the checkpoints with it, and AbsRel without.
     """
     metrics = run.metrics
     if metrics is None:
@@ -35,10 +37,26 @@ def quality(run: RunData) -> dict[str, Any] | None:
         "published": calibration.get("method") or next(iter(metrics["methods"]), None),
         "methods": [_method(name, metrics["methods"][name], name in random) for name in in_order(metrics["methods"])],
         "map": metrics.get("map"),
-        "checkpoints": metrics.get("checkpoints"),
+        "checkpoints": (metrics.get("without_control") or {}).get("checkpoints") or metrics.get("checkpoints"),
+        "shift": _shift(metrics),
         "calibration": {
             name: calibration.get(name) for name in ("n", "within_1_sigma", "within_2_sigma", "without_pose")
         },
+    }
+
+
+def _shift(metrics: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What control points moved the truth by, and what that changes."""
+    control, without = metrics.get("control_points"), metrics.get("without_control")
+    if not control or not without:
+        return None
+    published = (metrics.get("calibration") or {}).get("method")
+    entry = without["methods"].get(published) if published else None
+    return {
+        "translation_m": control["translation_m"],
+        "sigma_m": control["sigma_m"],
+        "checkpoints": metrics.get("checkpoints"),
+        "abs_rel_without": entry["common"]["abs_rel"] if entry else None,
     }
 
 

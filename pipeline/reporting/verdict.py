@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,7 +55,7 @@ def headline(numbers: Numbers) -> list[Card]:
     own = _published(good)
     cards.append(
         Card(
-            share(own["abs_rel_own"]),
+            _percent(own["abs_rel_own"]),
             "mean relative depth error",
             f"RMSE {number(own['rmse_own_m'])} m · {number(own['n_own'])} pixels",
         )
@@ -72,6 +73,11 @@ def headline(numbers: Numbers) -> list[Card]:
         Card(share(one), "of errors within one sigma", f"68 % expected; within two {share(two)}, 95 % expected")
     )
     return cards
+
+
+def _percent(value: float | None) -> str:
+    """A small share, with its significant digits."""
+    return MISSING if value is None else f"{number(100.0 * value, 2)} %"
 
 
 def flown_lines(numbers: Numbers) -> Iterator[Line]:
@@ -131,6 +137,7 @@ def good_lines(numbers: Numbers) -> Iterator[Line]:
                 f"AbsRel {number(method['abs_rel'])}{interval(method['abs_rel_95'])}, RMSE {number(method['rmse_m'])} m"
             )
             yield Line(label(method["method"]), f"{text}{interval(method['rmse_m_95'])}")
+    yield from _shift_line(good)
     yield from _comparison(good)
     if (at := good.get("map")) and at["rmse_z_m"] is not None:
         whole = f", {number(at['rmse_3d_m'])} m in space" if at.get("rmse_3d_m") is not None else ""
@@ -139,15 +146,32 @@ def good_lines(numbers: Numbers) -> Iterator[Line]:
         )
     checked = good.get("checkpoints")
     if checked and checked["n"]:
-        rmse = " / ".join(number(checked[name]) for name in ("rmse_h_m", "rmse_v_m", "rmse_3d_m"))
         short = f"; {checked['shortfall']} short of {checked['required']}" if checked["shortfall"] else ""
-        yield Line("Checkpoints", f"RMSE horizontal / vertical / 3D {rmse} m at {checked['n']}{short}")
+        yield Line("Checkpoints", f"{_rmse(checked)} at {checked['n']}, as delivered{short}")
     else:
         yield Line("Checkpoints", f"none of the {CHECKPOINTS} that ASPRS asks for")
     shares = good["calibration"]
     if shares["within_1_sigma"] is not None:
         told = f"{share(shares['within_1_sigma'])} within one sigma, {share(shares['within_2_sigma'])} within two"
         yield Line("Sigmas", f"{told} ({share(WITHIN[1])} and {share(WITHIN[2])} expected)")
+
+
+def _rmse(checked: Mapping[str, Any]) -> str:
+    rmse = " / ".join(number(checked[name]) for name in ("rmse_h_m", "rmse_v_m", "rmse_3d_m"))
+    return f"RMSE horizontal / vertical / 3D {rmse} m"
+
+
+def _shift_line(good: Mapping[str, Any]) -> Iterator[Line]:
+    """What the depths' figures owe to control points."""
+    shift = good.get("shift")
+    if not shift:
+        return
+    text = f"the truth was moved by {number(math.hypot(*shift['translation_m']))} m before depths were compared"
+    if shift["abs_rel_without"] is not None:
+        text += f"; without it AbsRel {number(shift['abs_rel_without'])}"
+    if (checked := shift["checkpoints"]) and checked["n"]:
+        text += f"; with it checkpoints have {_rmse(checked)}, each by the others"
+    yield Line("Control points", text)
 
 
 def _truth_line(good: Mapping[str, Any]) -> Iterator[Line]:

@@ -90,7 +90,7 @@ results: $(READY) example room/workflow.toml
 	$(MAKE) --no-print-directory run WORKFLOW=room/workflow.toml OUT=runs/room
 	$(BIN)/python docs/results.py README.md "Example flight=runs/example" "Room with motion capture=runs/room"
 	$(BIN)/python docs/pictures.py runs/example docs
-	! command -v chromium >/dev/null || $(BIN)/python benchmarks/report_browser.py runs/example --pictures docs/report
+	! command -v chromium >/dev/null || $(BIN)/python benchmarks/report_browser.py runs/example --pictures runs/example-report
 
 clean:
 	rm -rf runs example room $(VENV)

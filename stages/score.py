@@ -35,7 +35,7 @@ from pipeline.sources.depth_images import SUFFIXES
 from pipeline.sources.files import find, is_url
 
 # Frames scored together share the truth about them; where a frame takes long, progress is wanted.
-_FRAMES_PER_SHARD, _SLOW_FRAMES_PER_SHARD = 8, 2
+_FEWEST_PER_SHARD, _MOST_PER_SHARD, _SHARDS, _SLOW_PER_SHARD = 4, 20, 8, 2
 
 
 class Config(StageConfig):
@@ -115,7 +115,7 @@ def run(config: Config, context: Context) -> str:
     named = _control(config)
     control = control_of(context, named) if named else None
     believed = _believed(config, context, views, control.margin_m if control else 0.0)
-    found = collect(context, _job(config, context, believed, control), views, folder)
+    found = collect(context, _job(config, context, believed, control, len(views)), views, folder)
     tell(context, found[0])
     if not found[0].n_scored:
         raise believed.nothing(found[0].frames)
@@ -125,7 +125,8 @@ def run(config: Config, context: Context) -> str:
     return sentence(metrics)
 
 
-def _job(config: Config, context: Context, believed: Believed, control: Control | None) -> ScoringJob:
+def _job(config: Config, context: Context, believed: Believed, control: Control | None, frames: int) -> ScoringJob:
+    shard = min(max(frames // _SHARDS, _FEWEST_PER_SHARD), _MOST_PER_SHARD)
     dense = config.correspondence == "dense"
     lines = dense_lines(context, config.dense_matcher, config.dense_points) if dense else sparse_lines(context)
     baselines = baselines_of(context, config.baselines, config.models)
@@ -136,7 +137,7 @@ def _job(config: Config, context: Context, believed: Believed, control: Control 
         baselines,
         control.correction if control else None,
         cloud_of(context, believed.tiles, config.max_range_m, config.lidar_sigma_m),
-        shard=_SLOW_FRAMES_PER_SHARD if dense or config.baselines else _FRAMES_PER_SHARD,
+        shard=_SLOW_PER_SHARD if dense or config.baselines else shard,
         # One device serves one process.
         here=device_of_job(lines, baselines) != "cpu",
     )

@@ -9,9 +9,9 @@ import numpy as np
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
 from pipeline.lidar.reach import Reach
 
-# Edge of a voxel as the nearest camera sees it: a pixel or two more than a bin of the z-buffer. Edges come in steps of
-# a square root of two, so that neighbouring returns are of one grid; a voxel is 2.8 to 4 px wide.
-_LARGEST_PX = 4.0
+# Edge of a voxel as the nearest camera sees it, of the order of the distance between the matches that are scored. Edges
+# come in steps of a square root of two, so that neighbouring returns are of one grid; a voxel is 5.7 to 8 px wide.
+_LARGEST_PX = 8.0
 _STEPS_PER_OCTAVE = 2.0
 _SMALLEST_M = 0.01
 # Returns that a voxel's footprint has to hold, for thinning to be worth it. A survey sparser than this stays whole.

@@ -140,7 +140,8 @@ def gather(
             for piece in pieces_of(tile, ways[tile.crs_wkt].mask.meets)
         )
     ]
-    thinning = Thinning(focal_px)
+    # Sweeps were thinned when they were put together, and surfaces indoors are small.
+    thinning = Thinning(focal_px) if local.from_above else None
     job = _Job(local, ways, thinning, folder)
     seen, entries = Seen(), [np.zeros(0, _INDEX)]
     for part, came_by in context_map(partial(spill, job), items, shard=1, label="tiles"):

@@ -93,6 +93,9 @@ def main(arguments: Sequence[str]) -> None:
     work.mkdir(parents=True, exist_ok=True)
     run = work / "run"
     shutil.copytree(source, run)
+    # The example's own control points would be used where none are named.
+    recipe = run / "workflow.toml"
+    recipe.write_text("".join(line for line in recipe.open() if not line.startswith("control_")))
     elsewhere = shifted_survey(example, work, shift_m)
     print(f"survey shifted by {shift_m} m")
     for where, survey in (("as surveyed", example), ("shifted", elsewhere)):

@@ -54,6 +54,9 @@ class Config(StageConfig):
     lidar_mount: MountConfig | None = Field(
         None, description="The LiDAR (axes forward, left, up) on what is posed, where a bag does not say: as mount"
     )
+    lidar_clock_offset_s: float = Field(
+        0.0, description="Added to the times of a bag's LiDAR sweeps to make them those of camera and poses (s)"
+    )
     pose_topic: str | None = Field(
         None, description="Topic of the poses to use in bags with several; none: the longest"
     )
@@ -144,6 +147,7 @@ def _wishes(config: Config) -> steps.Wishes:
         y_up=config.up_axis == "y",
         spacing_m=config.frame_spacing_m,
         clock_offset_s=None if config.clock_offset_s == "auto" else float(config.clock_offset_s),
+        lidar_clock_offset_s=config.lidar_clock_offset_s,
     )
 
 

@@ -21,7 +21,7 @@ from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.lidar import sweeps as module
 from pipeline.lidar import voxels
 from pipeline.lidar.spacing import surface_spacing_m
-from pipeline.lidar.sweeps import placed, write_sweeps
+from pipeline.lidar.sweeps import on_clock, placed, write_sweeps
 from pipeline.lidar.tiles import read_local_tile, read_returns
 from pipeline.lidar.voxels import Voxels, append, by_tile, merged
 from pipeline.sources.records import Nanoseconds, Sweep
@@ -91,6 +91,14 @@ def test_every_return_is_placed_by_the_pose_of_its_own_instant() -> None:
     frozen = Sweep(sweep.time_ns, sweep.p_in_sensor_m, np.zeros_like(sweep.delay_s))
     off = np.linalg.norm(placed(frozen, moving, 0.0, 100.0) - place, axis=1)
     assert 0.3 < np.median(off) < 3.0
+
+
+def test_a_lidar_whose_clock_is_another_is_placed_where_it_was() -> None:
+    for sweep, place in box_sweeps(3):
+        # Its clock shows 0.25 s less than that of the poses.
+        late = Sweep(sweep.time_ns - 250_000_000, sweep.p_in_sensor_m, sweep.delay_s)
+        assert np.abs(placed(late, on_clock(moving, 0.25), 0.0, 100.0) - place).max() < 1e-6
+        assert np.abs(placed(late, moving, 0.0, 100.0) - place).max() > 0.1
 
 
 def test_rotations_take_the_sensor_to_the_world() -> None:

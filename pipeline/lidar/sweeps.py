@@ -80,6 +80,17 @@ def write_sweeps(
     return written
 
 
+def on_clock(pose_at: PoseAt, offset_s: float) -> PoseAt:
+    """Poses at the instants of a LiDAR whose clock is another one.
+
+    Args:
+        pose_at: Where the sensor was, by the poses' clock.
+        offset_s: What makes the LiDAR's times the poses', s.
+    """
+    offset_ns = round(offset_s * NS_PER_S)
+    return lambda time_ns: pose_at(time_ns + offset_ns)
+
+
 def placed(sweep: Sweep, pose_at: PoseAt, min_range_m: float, max_range_m: float) -> Floats:
     """The returns of a sweep in the run's frame, the sensor's motion during the sweep taken out.
 

@@ -11,7 +11,7 @@ from pipeline.engine.errors import InputError, UndeterminedError
 from pipeline.engine.stage import Context
 from pipeline.geodesy.enu import LocalFrame
 from pipeline.geometry.arrays import Ints
-from pipeline.lidar.sweeps import write_sweeps
+from pipeline.lidar.sweeps import on_clock, write_sweeps
 from pipeline.placing.gather import (
     Extracted,
     as_photo,
@@ -57,6 +57,7 @@ class Wishes:
         y_up: Whether the y axis of a local frame points up.
         spacing_m: Way between two images taken out of a bag or video.
         clock_offset_s: What makes the photos' times UTC; None to find out.
+        lidar_clock_offset_s: What makes the LiDAR's times the poses'.
     """
 
     camera: str | None
@@ -67,6 +68,7 @@ class Wishes:
     y_up: bool
     spacing_m: float
     clock_offset_s: float | None
+    lidar_clock_offset_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,5 +305,6 @@ def write_sweeps_of(context: Context, sources: Sequence[Source], origin: LocalFr
             context.warn(f"the sweeps of {stream.stream} are left out: {error.message} ({error.hint})")
             continue
         folder = context.output("sweeps") / f"bag-{number:02d}"
-        written += write_sweeps(read_sweeps(log.location, stream.stream, log.time_base.epoch), poses, folder)
+        sweeps = read_sweeps(log.location, stream.stream, log.time_base.epoch)
+        written += write_sweeps(sweeps, on_clock(poses, wishes.lidar_clock_offset_s), folder)
     return written

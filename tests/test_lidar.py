@@ -442,30 +442,26 @@ def test_visibility_on_the_synthetic_site_against_its_rays() -> None:
 # ---- reference depth
 
 
-def seen_plane(
-    normal: np.ndarray, offset: float, camera: Camera, noise: float = 0.0
-) -> tuple[VisibleReturns, np.ndarray]:
+def seen_plane(normal: np.ndarray, offset: float, camera: Camera, noise: float = 0.0) -> VisibleReturns:
     rng = np.random.default_rng(8)
     pixels = rng.uniform((0, 0), (799, 599), (6000, 2))
     depth = offset / (camera.rays(pixels) @ normal)
     depth = depth + noise * rng.normal(size=len(depth))
-    return VisibleReturns(np.arange(6000), pixels, depth, np.full(6000, 9.0)), camera.focal_px * camera.rays(pixels)[
-        :, :2
-    ]
+    return VisibleReturns(np.arange(6000), pixels, depth, np.full(6000, 9.0))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, BARREL])
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.1, 0.94, 0.34), (0.7, 0.0, 0.71)])
 def test_reference_is_exact_on_slanted_planes(camera: Camera, normal: tuple[float, float, float]) -> None:
     plane = np.array(normal)
-    visible, ideal = seen_plane(plane, 20.0, camera)
+    visible = seen_plane(plane, 20.0, camera)
     front = visible.depth_m > 1.0
     visible = VisibleReturns(
         visible.index[front], visible.pixels[front], visible.depth_m[front], visible.footprint_px[front]
     )
     pixels = np.random.default_rng(9).uniform((40, 330), (760, 580), (500, 2))
     rays = camera.rays(pixels)
-    found = reference_depth(pixels, camera.focal_px * rays[:, :2], visible, ideal[front])
+    found = reference_depth(camera, pixels, visible)
     assert found.valid.mean() > 0.7
     truth = 20.0 / (rays @ plane)
     np.testing.assert_allclose(found.depth_m[found.valid], truth[found.valid], rtol=1e-9)
@@ -473,30 +469,30 @@ def test_reference_is_exact_on_slanted_planes(camera: Camera, normal: tuple[floa
 
 
 def test_spread_is_the_noise_of_the_returns() -> None:
-    visible, ideal = seen_plane(np.array([0.0, 0.0, 1.0]), 30.0, CAMERA, noise=0.05)
+    visible = seen_plane(np.array([0.0, 0.0, 1.0]), 30.0, CAMERA, noise=0.05)
     pixels = np.random.default_rng(10).uniform((40, 40), (760, 560), (2000, 2))
-    found = reference_depth(pixels, CAMERA.focal_px * CAMERA.rays(pixels)[:, :2], visible, ideal)
+    found = reference_depth(CAMERA, pixels, visible)
     assert 0.044 < np.sqrt(np.mean(found.spread_m[found.valid] ** 2)) < 0.056
     assert 0.01 < np.std(found.depth_m[found.valid] - 30.0) < 0.035
 
 
 def test_no_reference_across_an_edge_off_the_data_or_without_enough() -> None:
-    visible, ideal = seen_plane(np.array([0.0, 0.0, 1.0]), 30.0, CAMERA)
+    visible = seen_plane(np.array([0.0, 0.0, 1.0]), 30.0, CAMERA)
     step = VisibleReturns(
         visible.index, visible.pixels, np.where(visible.pixels[:, 0] < 400, 30.0, 36.0), visible.footprint_px
     )
     down = np.linspace(50, 550, 200)
     for u, share in ((400.0, (0.0, 0.05)), (300.0, (0.75, 1.0)), (500.0, (0.75, 1.0)), (1000.0, (0.0, 0.0))):
         pixels = np.column_stack([np.full(200, u), down])
-        found = reference_depth(pixels, CAMERA.focal_px * CAMERA.rays(pixels)[:, :2], step, ideal)
+        found = reference_depth(CAMERA, pixels, step)
         assert share[0] <= found.valid.mean() <= share[1]
         np.testing.assert_array_equal(np.isfinite(found.depth_m), found.valid)
     few = VisibleReturns(
         *(values[: NEIGHBOURS - 1] for values in (step.index, step.pixels, step.depth_m, step.footprint_px))
     )
-    assert not reference_depth(pixels, pixels, few, ideal[: NEIGHBOURS - 1]).valid.any()
+    assert not reference_depth(CAMERA, pixels, few).valid.any()
     nan = np.full((3, 2), np.nan)
-    assert not reference_depth(nan, nan, step, ideal).valid.any()
+    assert not reference_depth(CAMERA, nan, step).valid.any()
 
 
 def test_height_field_fills_small_gaps_only() -> None:

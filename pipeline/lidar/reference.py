@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,7 @@ _LEAST_REACH_PX = 4.0
 # The neighbours surround the pixel when their mean is not further off than this share of their own spread.
 _OFF_CENTRE = 0.75
 # Spread about the plane, in shares of the depth, beyond which the pixel is at an edge or on no surface.
-LARGEST_SPREAD = 0.01
+_LARGEST_SPREAD = 0.01
 # Neighbours nearly in one line of the image fix no plane.
 _LEAST_ROUNDNESS = 0.02
 
@@ -47,59 +46,47 @@ class Reference:
         nothing = np.full(count, np.nan)
         return cls(nothing, nothing, np.full((count, 2), np.nan), np.zeros(count, np.bool_))
 
+    @classmethod
+    def of_planes(cls, count: int, rows: Ints, offset: Floats, inverse: Floats) -> Reference:
+        """References at some of the pixels, each by the plane through its neighbours; none where these make none.
+
+        The inverse depth of a plane is affine in ideal (undistorted) pixels, so the fit is exact on planes at any
+        slant.
+
+        Args:
+            count: Pixels in all.
+            rows: (n,) those that have neighbours.
+            offset: (n, k, 2) ideal pixels of the neighbours less that of the pixel.
+            inverse: (n, k) their inverse depths, 1/m.
+        """
+        level, gradient, residual, sound = _plane_at_centre(offset, inverse)
+        sound &= (level > 0.0) & (residual <= _LARGEST_SPREAD * level)
+        rows, level, residual = rows[sound], level[sound], residual[sound]
+        depth, spread, slope = np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan)
+        depth[rows] = 1.0 / level
+        spread[rows] = residual / level**2
+        slope[rows] = gradient[sound]
+        return cls(depth, spread, slope, np.isfinite(depth))
+
     def where(self, rows: AnyArray) -> Reference:
         """Those at some pixels."""
         return Reference(self.depth_m[rows], self.spread_m[rows], self.slope[rows], self.valid[rows])
 
 
-def reference_through(camera: Camera, pixels: Floats, visible: VisibleReturns) -> Reference:
+def reference_depth(camera: Camera, pixels: Floats, visible: VisibleReturns) -> Reference:
     """Reference depths at pixels of a camera from the visible returns around them.
-
-    As `reference_depth`, with only the returns that are used brought to ideal pixels.
 
     Args:
         camera: Whose pixels they are.
-        pixels: (n, 2) u, v of the image as given.
+        pixels: (n, 2) u, v of the image as given; NaN gives none.
         visible: The visible returns.
 
     Returns:
         One depth per pixel.
     """
-    focal = camera.focal_px
-
-    def ideal(rows: Ints) -> Floats:
-        used, back = np.unique(rows, return_inverse=True)
-        out: Floats = (focal * camera.rays(visible.pixels[used])[:, :2])[back.reshape(rows.shape)]
-        return out
-
-    return _fitted(pixels, focal * camera.rays(pixels)[:, :2], visible, ideal)
-
-
-def reference_depth(pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal_visible: Floats) -> Reference:
-    """Reference depths at pixels from the visible returns around them.
-
-    The inverse depth of a plane is affine in ideal (undistorted) pixels, so the fit is exact on planes at any slant.
-
-    Args:
-        pixels: (n, 2) u, v of the image as given.
-        ideal_pixels: (n, 2) the same without distortion, px (any scale common with `ideal_visible`); NaN gives none.
-        visible: The visible returns.
-        ideal_visible: (m, 2) their pixels without distortion.
-
-    Returns:
-        One depth per pixel.
-    """
-    return _fitted(pixels, ideal_pixels, visible, lambda rows: ideal_visible[rows])
-
-
-def _fitted(
-    pixels: Floats, ideal_pixels: Floats, visible: VisibleReturns, ideal: Callable[[Ints], Floats]
-) -> Reference:
-    """The planes; `ideal` gives the ideal pixels of some visible returns."""
-    count = len(pixels)
-    depth, spread, slope = np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan)
-    ok = np.isfinite(pixels).all(axis=1) & np.isfinite(ideal_pixels).all(axis=1)
-    rows = np.flatnonzero(ok)
+    count, focal = len(pixels), camera.focal_px
+    ideal = focal * camera.rays(pixels)[:, :2]
+    rows = np.flatnonzero(np.isfinite(pixels).all(axis=1) & np.isfinite(ideal).all(axis=1))
     if len(visible.depth_m) < NEIGHBOURS or not len(rows):
         return Reference.none(count)
     # A tree asked so little is not worth balancing.
@@ -110,18 +97,13 @@ def _fitted(
     rows, near = rows[close], near[close]
     if not len(rows):
         return Reference.none(count)
-    inverse, gradient, residual, sound = plane_at_centre(
-        ideal(near) - ideal_pixels[rows, None, :], 1.0 / visible.depth_m[near]
-    )
-    sound &= (inverse > 0.0) & (residual <= LARGEST_SPREAD * inverse)
-    rows, inverse, residual = rows[sound], inverse[sound], residual[sound]
-    depth[rows] = 1.0 / inverse
-    spread[rows] = residual / inverse**2
-    slope[rows] = gradient[sound]
-    return Reference(depth, spread, slope, np.isfinite(depth))
+    # Only the returns that are used are brought to ideal pixels.
+    used, back = np.unique(near, return_inverse=True)
+    around = (focal * camera.rays(visible.pixels[used])[:, :2])[back.reshape(near.shape)]
+    return Reference.of_planes(count, rows, around - ideal[rows, None, :], 1.0 / visible.depth_m[near])
 
 
-def plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Floats, Bools]:
+def _plane_at_centre(offset: Floats, inverse: Floats) -> tuple[Floats, Floats, Floats, Bools]:
     """Least-squares affine function through neighbours, at offset zero.
 
     Args:

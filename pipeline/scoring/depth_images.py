@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.engine.errors import InputError
-from pipeline.geometry.arrays import Floats, Ints
+from pipeline.geometry.arrays import Bools, Floats, Ints
 from pipeline.geometry.cameras import Camera
-from pipeline.lidar.reference import LARGEST_SPREAD, Reference, plane_at_centre
+from pipeline.lidar.reference import Reference
 from pipeline.scoring.truth import FrameView
 from pipeline.sources.depth_images import read_depth_image
 
@@ -108,16 +108,17 @@ class DepthSeen:
         focal = self.camera.focal_px
         ideal = focal * self.camera.rays(self._in_photo(around))[..., :2]
         centre = self.camera.rays(pixels[rows])
-        inverse, slope, residual, sound = plane_at_centre(ideal - focal * centre[:, None, :2], 1.0 / window)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sound &= (inverse > 0.0) & (residual <= LARGEST_SPREAD * inverse)
-            sound &= np.linalg.norm(centre, axis=1) / inverse <= self.max_range_m
-        return _placed(len(pixels), rows[sound], inverse[sound], slope[sound], residual[sound])
+        found = Reference.of_planes(len(pixels), rows, ideal - focal * centre[:, None, :2], 1.0 / window)
+        return replace(found, valid=found.valid & self._in_range(pixels, found.depth_m))
 
     def pose_sigma(self, pixels: Floats, reference: Reference) -> Floats:
         """As `FrameTruth.pose_sigma`: nothing."""
         del reference
         return np.zeros(len(pixels))
+
+    def _in_range(self, pixels: Floats, depth_m: Floats) -> Bools:
+        out: Bools = depth_m * np.linalg.norm(self.camera.rays(pixels), axis=1) <= self.max_range_m
+        return out
 
     def _measured(self) -> tuple[Ints, Ints]:
         rows, columns = np.nonzero(np.isfinite(self.image_m[::_STEP, ::_STEP]))
@@ -131,11 +132,3 @@ class DepthSeen:
     def _in_photo(self, pixels: Floats) -> Floats:
         out: Floats = (pixels + 0.5) / self._scale() - 0.5
         return out
-
-
-def _placed(count: int, rows: Ints, inverse: Floats, slope: Floats, residual: Floats) -> Reference:
-    depth, spread, gradient = np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan)
-    depth[rows] = 1.0 / inverse
-    spread[rows] = residual / inverse**2
-    gradient[rows] = slope
-    return Reference(depth, spread, gradient, np.isfinite(depth))

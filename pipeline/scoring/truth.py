@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.geometry.arrays import Floats
 from pipeline.lidar.blocks import Blocks
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
-from pipeline.lidar.reference import Reference, reference_through
+from pipeline.lidar.reference import Reference, reference_depth
 from pipeline.lidar.spacing import surface_spacing_m
 from pipeline.lidar.store import Store
 from pipeline.lidar.visibility import View, VisibleReturns, behind_columns, visible_returns
@@ -177,7 +177,7 @@ class SurveySeen:
         # The same feature is matched in several pairs: its reference is found once.
         distinct, back = np.unique(pixels, axis=0, return_inverse=True)
         rays = view.camera.rays(distinct)
-        found = reference_through(view.camera, distinct, self.visible)
+        found = reference_depth(view.camera, distinct, self.visible)
         valid = found.valid & (found.depth_m * np.linalg.norm(rays, axis=1) <= most)
         if field is not None:
             # A pixel on a wall or pole with few returns takes its plane from what is seen behind: a column says so.

@@ -20,9 +20,10 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import enu_from_cam
 from pipeline.lidar.heightfield import HeightField, return_spacing_m
 from pipeline.lidar.nearby import LocalTiles, returns_near
+from pipeline.lidar.pieces import read_returns
 from pipeline.lidar.reference import NEIGHBOURS, reference_depth
 from pipeline.lidar.tile_crs import has_heights, tile_crs
-from pipeline.lidar.tiles import Tile, expand, read_returns, read_tile
+from pipeline.lidar.tiles import Tile, expand, read_tile
 from pipeline.lidar.visibility import View, VisibleReturns, behind_columns, in_image, visible_returns
 from pipeline.simulation import tiles as simulation
 from pipeline.simulation.flight import fly
@@ -70,7 +71,7 @@ def test_a_tile_comes_back_by_chunk_and_by_box(tmp_path: Path) -> None:
     xyz = some_points()
     tile = read_tile(write_tile(tmp_path / "a.laz", xyz))
     assert tile.point_count == 50
-    np.testing.assert_allclose(all_returns(tile, chunk_points=7), xyz, atol=0.00051)
+    np.testing.assert_allclose(all_returns(tile, chunk_returns=7), xyz, atol=0.00051)
     west = list(read_returns(tile, np.array([0.0, 0.0]), np.array([562005.0, 1e9])))
     assert sum(map(len, west)) == (xyz[:, 0] <= 562005.0).sum()
     assert tile.meets(xyz.min(axis=0), xyz.max(axis=0))
@@ -276,7 +277,7 @@ def middle_frame(tile: Tile) -> LocalFrame:
 @pytest.mark.real
 def test_a_real_tile_is_read_whole_and_its_classes_filtered(shared: Path) -> None:
     tile = read_tile(shared / "data" / "lidar" / "pdal" / "las_with_several_extra_byte_bloc.laz", "EPSG:5720")
-    xyz = all_returns(tile, chunk_points=200_000)
+    xyz = all_returns(tile, chunk_returns=200_000)
     assert len(xyz) == tile.point_count == 697_721
     np.testing.assert_allclose([xyz.min(axis=0), xyz.max(axis=0)], [tile.minimum, tile.maximum], atol=0.01)
     assert 0.30 < return_spacing_m(xyz) < 0.40

@@ -20,9 +20,10 @@ from pipeline.geometry.arrays import Floats
 from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.lidar import sweeps as module
 from pipeline.lidar import voxels
+from pipeline.lidar.pieces import read_returns
 from pipeline.lidar.spacing import surface_spacing_m
 from pipeline.lidar.sweeps import on_clock, placed, write_sweeps
-from pipeline.lidar.tiles import read_local_tile, read_returns
+from pipeline.lidar.tiles import read_local_tile
 from pipeline.lidar.voxels import Voxels, append, by_tile, merged
 from pipeline.sources.records import Nanoseconds, Sweep
 

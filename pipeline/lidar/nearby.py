@@ -11,7 +11,8 @@ from pipeline.geodesy.heights import LOCAL
 from pipeline.geodesy.local_world import LocalTransform
 from pipeline.geodesy.transform import FrameTransform, to_enu
 from pipeline.geometry.arrays import Bools, Floats
-from pipeline.lidar.tiles import Tile, read_returns
+from pipeline.lidar.pieces import read_returns
+from pipeline.lidar.tiles import Tile
 
 # 24 bytes each: some 190 MiB at most, whatever the tiles' density.
 MOST_RETURNS = 8_000_000

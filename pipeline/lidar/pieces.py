@@ -123,6 +123,34 @@ def read_piece(
         raise unreadable(piece.tile.path, error) from error
 
 
+def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_returns: int = CHUNK_RETURNS) -> Iterator[Floats]:
+    """The returns of a tile in a horizontal box, by chunk; noise and withheld ones left out.
+
+    Args:
+        tile: From `read_tile`.
+        lower: (2+,) lower corner of the box, tile CRS.
+        upper: (2+,) upper corner.
+        chunk_returns: Returns decoded at once.
+
+    Yields:
+        (n, 3) x, y, z in the tile's CRS and units, all finite; never empty.
+
+    Raises:
+        InputError: The file is damaged or cut short.
+    """
+
+    def meets(low: Floats, high: Floats) -> bool:
+        return bool(np.all(low[:2] <= upper[:2]) and np.all(high[:2] >= lower[:2]))
+
+    def holds(x: Floats, y: Floats) -> Bools:
+        out: Bools = (x >= lower[0]) & (x <= upper[0]) & (y >= lower[1]) & (y <= upper[1])
+        return out
+
+    for piece in pieces_of(tile, meets):
+        for points in read_piece(piece, holds, Seen(), chunk_returns):
+            yield points.T
+
+
 def _by_range(piece: Piece, chunk_returns: int) -> Iterator[laspy.ScaleAwarePointRecord]:
     # One thread for each process: the processes are the parallelism.
     with laspy.open(

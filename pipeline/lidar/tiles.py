@@ -1,10 +1,10 @@
-"""LAS, LAZ and COPC tiles: which files, what their headers say, and their returns by chunk."""
+"""LAS, LAZ and COPC tiles: which files, and what their headers say."""
 
 from __future__ import annotations
 
 import glob
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +13,10 @@ import numpy as np
 import pyproj
 
 from pipeline.engine.errors import InputError
-from pipeline.geometry.arrays import Bools, Floats
+from pipeline.geometry.arrays import Floats
 from pipeline.lidar.public_header import check_public_header
 from pipeline.lidar.tile_crs import local_tile_crs, tile_crs
 
-CHUNK_POINTS = 1_000_000
 SUFFIXES = (".las", ".laz")
 # ASPRS LAS 1.4 R15, table 17: low point (noise), high noise.
 NOISE_CLASSES = (7, 18)
@@ -151,47 +150,6 @@ def read_header(path: Path) -> laspy.LasHeader:
             hint="rewrite it: pdal translate",
         )  # fmt: skip
     return header
-
-
-def read_returns(tile: Tile, lower: Floats, upper: Floats, chunk_points: int = CHUNK_POINTS) -> Iterator[Floats]:
-    """The returns of a tile in a horizontal box, by chunk; noise and withheld ones left out.
-
-    Args:
-        tile: From `read_tile`.
-        lower: (2+,) lower corner of the box, tile CRS.
-        upper: (2+,) upper corner.
-        chunk_points: Returns read at once.
-
-    Yields:
-        (n, 3) x, y, z in the tile's CRS and units, all finite; never empty.
-
-    Raises:
-        InputError: The file is damaged or cut short.
-    """
-    seen = 0
-    try:
-        with laspy.open(tile.path) as reader:
-            for chunk in reader.chunk_iterator(chunk_points):
-                seen += len(chunk)
-                points = _wanted(chunk, lower, upper)
-                if len(points):
-                    yield points
-    except UNREADABLE as error:
-        raise unreadable(tile.path, error) from error
-    if seen < tile.point_count:
-        raise InputError(
-            "E-LIDAR-02", "the tile is cut short", where=str(tile.path), found=f"{seen:,} returns",
-            expected=f"{tile.point_count:,} as its header says", hint="copy the file again",
-        )  # fmt: skip
-
-
-def _wanted(chunk: laspy.ScaleAwarePointRecord, lower: Floats, upper: Floats) -> Floats:
-    x, y = np.asarray(chunk.x, np.float64), np.asarray(chunk.y, np.float64)
-    keep: Bools = (x >= lower[0]) & (x <= upper[0]) & (y >= lower[1]) & (y <= upper[1])
-    keep &= ~np.isin(np.asarray(chunk.classification), NOISE_CLASSES) & ~np.asarray(chunk.withheld, np.bool_)
-    index = np.flatnonzero(keep)
-    points = np.column_stack([x[index], y[index], np.asarray(chunk.z, np.float64)[index]])
-    return points[np.isfinite(points).all(axis=1)]
 
 
 def unreadable(path: Path, error: BaseException) -> InputError:

@@ -51,6 +51,15 @@ class LocalTiles:
             return LocalTransform()
         return to_enu(tile.crs, self.frame, self.geoid, self.height_datum)
 
+    def transforms(self) -> dict[str, FrameTransform]:
+        """The way from each CRS among the tiles, by its WKT: PROJ takes its time to find one, and tiles are many.
+
+        Raises:
+            UndeterminedError: A height datum or the geoid between two is not known.
+        """
+        one_of_each = {tile.crs_wkt: tile for tile in self.tiles}
+        return {wkt: self.transform(tile) for wkt, tile in one_of_each.items()}
+
     def meeting(self, centres_in_enu_m: Floats, max_range_m: float) -> tuple[Tile, ...]:
         """The tiles that meet the box of the cameras and their range.
 
@@ -58,13 +67,10 @@ class LocalTiles:
             centres_in_enu_m: (n, 3) camera centres, ENU m; n >= 1.
             max_range_m: Largest distance of a return from its camera, m.
         """
-        met = []
-        for tile in self.tiles:
-            if tile.point_count:
-                lower, upper = _box_in_crs(self.transform(tile), centres_in_enu_m, max_range_m)
-                if tile.meets(lower, upper):
-                    met.append(tile)
-        return tuple(met)
+        boxes = {
+            wkt: box_in_crs(transform, centres_in_enu_m, max_range_m) for wkt, transform in self.transforms().items()
+        }
+        return tuple(tile for tile in self.tiles if tile.meets(*boxes[tile.crs_wkt]))
 
 
 def returns_near(local: LocalTiles, centres_in_enu_m: Floats, max_range_m: float, most: int = MOST_RETURNS) -> Floats:
@@ -85,12 +91,10 @@ def returns_near(local: LocalTiles, centres_in_enu_m: Floats, max_range_m: float
     """
     parts: list[Floats] = []
     stride, held = 1, 0
-    transforms: dict[str, FrameTransform] = {}
+    transforms = local.transforms()
     for tile in local.tiles:
-        if tile.crs_wkt not in transforms:
-            transforms[tile.crs_wkt] = local.transform(tile)
         transform = transforms[tile.crs_wkt]
-        lower, upper = _box_in_crs(transform, centres_in_enu_m, max_range_m)
+        lower, upper = box_in_crs(transform, centres_in_enu_m, max_range_m)
         if not tile.meets(lower, upper):
             continue
         for chunk in read_returns(tile, lower, upper):
@@ -112,8 +116,14 @@ def _near(points: Floats, centres: Floats, reach_m: float) -> Bools:
     return near
 
 
-def _box_in_crs(transform: FrameTransform, centres: Floats, reach_m: float) -> tuple[Floats, Floats]:
-    """Lower and upper corner, in the tile's CRS, of the box about the cameras."""
+def box_in_crs(transform: FrameTransform, centres: Floats, reach_m: float) -> tuple[Floats, Floats]:
+    """Lower and upper corner, (3,) each in a CRS, of the box about cameras.
+
+    Args:
+        transform: The way from the CRS.
+        centres: (n, 3) camera centres, ENU m.
+        reach_m: How far the box reaches beyond them, m.
+    """
     lower = centres.min(axis=0) - reach_m - _MARGIN_M
     upper = centres.max(axis=0) + reach_m + _MARGIN_M
     grid = np.meshgrid(*(np.linspace(low, high, 3) for low, high in zip(lower, upper, strict=True)))

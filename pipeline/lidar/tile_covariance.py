@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -34,7 +35,19 @@ def tile_covariance(points: Columns) -> Floats | None:
     """
     if not set(DIMENSIONS) <= set(points.array.dtype.names or ()):
         return None
-    sx, sy, sz, xy, xz, yz = (np.asarray(points[name], np.float64) for name in DIMENSIONS)
+    return covariance_of([points[name] for name in DIMENSIONS])
+
+
+def covariance_of(columns: Sequence[AnyArray]) -> Floats:
+    """Covariances from their columns.
+
+    Args:
+        columns: Sigmas of x, y and z in m, covariances of xy, xz and yz in m2, (n,) each.
+
+    Returns:
+        (n, 3, 3) m^2.
+    """
+    sx, sy, sz, xy, xz, yz = (np.asarray(column, np.float64) for column in columns)
     rows = (sx**2, xy, xz, xy, sy**2, yz, xz, yz, sz**2)
     out: Floats = np.stack(rows, axis=-1).reshape(-1, 3, 3)
     return out

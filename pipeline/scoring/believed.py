@@ -61,7 +61,7 @@ def survey(
         raise apart(tiles, centres, max_range_m)
     context.record("lidar", "the run's own sweeps" if named.lidar is None else "tiles named")
     context.record("lidar_tiles", {"given": len(tiles.tiles), "used": len(meeting)})
-    context.record("lidar_heights", sorted({tiles.transform(tile).height_note for tile in tiles.tiles}))
+    context.record("lidar_heights", sorted({transform.height_note for transform in tiles.transforms().values()}))
 
     def nothing(scores: Sequence[FrameScore]) -> NothingLeftError:
         matches, visible = (sum(getattr(score, name) for score in scores) for name in ("n_matches", "n_visible"))

@@ -20,13 +20,13 @@ from pipeline.geodesy.heights import LOCAL
 from pipeline.geodesy.local_world import LocalTransform
 from pipeline.geodesy.transform import FrameTransform, to_enu
 from pipeline.geometry.arrays import AnyArray, Bools, Floats
+from pipeline.lidar.nearby import box_in_crs
+from pipeline.lidar.tile_covariance import covariance_of
 from pipeline.points.geoparquet import PointDataset, coordinates
 from schemas.points import GEOMETRY
 
 _AXES = ("x", "y", "z")
 _COVARIANCE = ("sigma_x_m", "sigma_y_m", "sigma_z_m", "cov_xy", "cov_xz", "cov_yz")
-# The box in the dataset's CRS is found from the corners of the cameras'; this covers the curvature of its sides.
-_MARGIN_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +120,8 @@ class PointsNear:
             UndeterminedError: A height datum or the geoid between two is not known.
         """
         transform = self.transform
-        lower, upper = _box(transform, centres_in_enu_m, reach_m)
-        meets = np.all((self.bounds[:, :2] <= upper) & (self.bounds[:, 3:5] >= lower), axis=1)
+        lower, upper = box_in_crs(transform, centres_in_enu_m, reach_m)
+        meets = np.all((self.bounds[:, :2] <= upper[:2]) & (self.bounds[:, 3:5] >= lower[:2]), axis=1)
         tables = [_rows(self.files[i], lower, upper) for i in np.flatnonzero(meets)]
         points = [_points(table, transform) for table in tables if table.num_rows]
         if not points:
@@ -141,9 +141,7 @@ def _rows(path: Path, lower: Floats, upper: Floats) -> pa.Table:
 
 def _points(table: pa.Table, transform: FrameTransform) -> tuple[Floats, Floats, AnyArray]:
     p = transform.enu_from(coordinates(table))
-    sx, sy, sz, xy, xz, yz = (np.asarray(table.column(name).to_numpy(), np.float64) for name in _COVARIANCE)
-    rows = (sx**2, xy, xz, xy, sy**2, yz, xz, yz, sz**2)
-    covariance = np.stack(rows, axis=-1).reshape(-1, 3, 3)
+    covariance = covariance_of([table.column(name).to_numpy() for name in _COVARIANCE])
     return p, covariance_in_enu(covariance, p, transform), _names(table)
 
 
@@ -172,12 +170,3 @@ def _bounds(path: Path) -> list[float]:
     """What GeoParquet says of a file's extent; the dataset was checked before."""
     geo = json.loads(pq.read_metadata(path).metadata[b"geo"])
     return [float(x) for x in geo["columns"][GEOMETRY]["bbox"]]
-
-
-def _box(transform: FrameTransform, centres: Floats, reach_m: float) -> tuple[Floats, Floats]:
-    """Lower and upper corner, in the dataset's CRS, of the level box about the cameras."""
-    lower = centres.min(axis=0) - reach_m - _MARGIN_M
-    upper = centres.max(axis=0) + reach_m + _MARGIN_M
-    grid = np.meshgrid(*(np.linspace(low, high, 3) for low, high in zip(lower, upper, strict=True)))
-    corners = transform.from_enu(np.stack([axis.ravel() for axis in grid], axis=-1))
-    return corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)

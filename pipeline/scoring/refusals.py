@@ -49,8 +49,9 @@ def apart(tiles: LocalTiles, centres_in_enu_m: Floats, max_range_m: float) -> No
     """
     reach = np.array([[-max_range_m] * 3, [max_range_m] * 3])
     flight = np.stack([centres_in_enu_m.min(axis=0), centres_in_enu_m.max(axis=0)]) + reach
+    transforms = tiles.transforms()
     boxes = [
-        tiles.transform(tile).enu_from(np.array([tile.minimum, tile.maximum]))
+        transforms[tile.crs_wkt].enu_from(np.array([tile.minimum, tile.maximum]))
         for tile in tiles.tiles
         if tile.point_count
     ]

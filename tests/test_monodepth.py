@@ -25,7 +25,7 @@ from pipeline.geometry.arrays import Bytes, Floats
 from pipeline.matching.weights import files as weights
 from pipeline.monodepth import found as finding
 from pipeline.monodepth import known
-from pipeline.monodepth.baselines import BaselineSetting, depths_at
+from pipeline.monodepth.baselines import BaselineSetting, depth_maps
 from pipeline.monodepth.found import FoundModel, find_models, model_files, read_model
 from pipeline.monodepth.network import MonoDepth
 from pipeline.monodepth.sampling import sampled
@@ -191,7 +191,7 @@ def test_depths_at_pixels_of_a_photo(tiny: Path, image: Bytes, tmp_path: Path, m
     path = tmp_path / "photo.png"
     cv2.imwrite(str(path), image[:, :, ::-1])
     pixels = np.array([[0.0, 0.0], [17.25, 80.5], [WIDTH - 1, HEIGHT - 1], [WIDTH, 3.0]])
-    depths = depths_at(setting, path, pixels)
+    depths = {name: sampled(found, pixels) for name, found in depth_maps(setting, path).items()}
     assert list(depths) == list(NAMES)
     for model in setting.models:
         expected = sampled(MonoDepth(model, "cpu").depth_map(image), pixels)
@@ -205,9 +205,9 @@ def test_depths_at_pixels_of_a_photo(tiny: Path, image: Bytes, tmp_path: Path, m
 
 def test_no_baseline_loads_nothing(tmp_path: Path) -> None:
     code = (
-        "import sys, numpy; from pipeline.monodepth.baselines import BaselineSetting, depths_at\n"
+        "import sys; from pipeline.monodepth.baselines import BaselineSetting, depth_maps\n"
         "setting = BaselineSetting.find((), 'nowhere', 'auto')\n"
-        "assert depths_at(setting, 'nowhere.jpg', numpy.zeros((1, 2))) == {}\n"
+        "assert depth_maps(setting, 'nowhere.jpg') == {}\n"
         "sys.exit(bool({'torch', 'transformers', 'huggingface_hub', 'safetensors'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)

@@ -23,7 +23,7 @@ from pipeline.engine.runner import staleness
 from pipeline.reporting.accuracy_plots import figures as accuracy_figures
 from pipeline.reporting.calibration_plot import figures as calibration_figures
 from pipeline.reporting.counts import rule_of
-from pipeline.reporting.distrust import BIN_TIMES, CHECKPOINTS, MASKED_SHARE, doubts
+from pipeline.reporting.distrust import BIN_TIMES, MASKED_SHARE, doubts
 from pipeline.reporting.figure import Figure, axis_titles
 from pipeline.reporting.gathered import RunData
 from pipeline.reporting.numbers import numbers
@@ -39,6 +39,7 @@ from pipeline.reporting.tables import (
 )
 from pipeline.reporting.verdict import good_lines, headline
 from pipeline.reporting.words import number
+from pipeline.scoring.checkpoints import REQUIRED
 from stages.registry import STAGES
 from stages.workflow import kept_configuration
 
@@ -469,7 +470,7 @@ def sound() -> dict[str, Any]:
     depths = {"n": 1000, "kept": 1000 - int(1000 * MASKED_SHARE), "masked_by_reason": {"far": int(1000 * MASKED_SHARE)}}
     good = {
         "truth": metrics()["truth"], "published": "epitransfer", "map": None,
-        "checkpoints": {"n": CHECKPOINTS}, "calibration": {"within_1_sigma": 0.683, "within_2_sigma": 0.954},
+        "checkpoints": {"n": REQUIRED}, "calibration": {"within_1_sigma": 0.683, "within_2_sigma": 0.954},
         "methods": [
             {"method": name, "untrained": False, "n_common": 900, "n_own": 1000, "kept_share": 0.9}
             for name in ("epitransfer", "dlt")

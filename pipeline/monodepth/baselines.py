@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.geometry.arrays import Floats
+from pipeline.geometry.arrays import Singles
 from pipeline.matching.images import read_colour
 from pipeline.monodepth.found import FoundModel, find_models
-from pipeline.monodepth.sampling import sampled
 
 if TYPE_CHECKING:
     from pipeline.monodepth.network import MonoDepth
@@ -55,16 +54,15 @@ class BaselineSetting:
         return cls(tuple(names), models, choose_device(device).type)
 
 
-def depths_at(setting: BaselineSetting, image: Path | str, pixels: Floats) -> dict[str, Floats]:
-    """What each baseline says of an image, at some pixels.
+def depth_maps(setting: BaselineSetting, image: Path | str) -> dict[str, Singles]:
+    """What each baseline says of an image; `sampled` asks at pixels.
 
     Args:
         setting: The baselines.
         image: File or URL of the image as given; its orientation tag is ignored, as matching does.
-        pixels: (n, 2) x and y (px) of the image as given.
 
     Returns:
-        By name: (n,) depths along the optical axis (m); NaN outside of the image and where there is none.
+        By name: (h, w) depths along the optical axis (m) at the image's own size.
 
     Raises:
         InputError: The image cannot be read, or a model's weights do not fit it.
@@ -73,9 +71,7 @@ def depths_at(setting: BaselineSetting, image: Path | str, pixels: Floats) -> di
     if not setting.models:
         return {}
     colours = read_colour(image)
-    return {
-        model.baseline: sampled(_loaded(model, setting.device).depth_map(colours), pixels) for model in setting.models
-    }
+    return {model.baseline: _loaded(model, setting.device).depth_map(colours) for model in setting.models}
 
 
 @functools.cache

@@ -15,6 +15,7 @@ from pipeline.reporting.gathered import RunData
 from pipeline.reporting.palette import label
 from pipeline.reporting.words import number
 from pipeline.reporting.words import share as percent
+from pipeline.scoring.checkpoints import REQUIRED
 
 # Ranks.
 GRAVE, MIND, KNOW = 3, 2, 1
@@ -29,8 +30,6 @@ BIN_TIMES, BIN_LEAST = 1.5, 100
 MASKED_SHARE, UNSEEN_SHARE, UNCOMMON_SHARE = 0.3, 0.3, 0.5
 # A shift is told beyond this, and beyond so many of its sigmas.
 _SHIFT_M, _SHIFT_SIGMAS = 0.05, 3.0
-# ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2 (2023): least number of checkpoints.
-CHECKPOINTS = 30
 
 Numbers = Mapping[str, Any]
 
@@ -124,8 +123,8 @@ def _checkpoints(run: RunData, numbers: Numbers) -> Iterator[Doubt]:
     if not checked["n"]:
         text = "No checkpoint was measured: LiDAR tells depth along the rays, not whether the map as a whole is shifted"
         yield Doubt("checkpoints", MIND, text)
-    elif checked["n"] < CHECKPOINTS:
-        text = f"{counted(checked['n'], 'checkpoint')}, where ASPRS asks for {CHECKPOINTS} before an accuracy is stated"
+    elif checked["n"] < REQUIRED:
+        text = f"{counted(checked['n'], 'checkpoint')}, where ASPRS asks for {REQUIRED} before an accuracy is stated"
         yield Doubt("checkpoints", MIND, text)
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.engine.progress import counted
-from pipeline.reporting.distrust import CHECKPOINTS, RANKS, WITHIN
+from pipeline.reporting.distrust import RANKS, WITHIN
 from pipeline.reporting.palette import label
 from pipeline.reporting.words import MISSING, interval, number, share
+from pipeline.scoring.checkpoints import REQUIRED
 
 Numbers = Mapping[str, Any]
 
@@ -62,7 +63,7 @@ def headline(numbers: Numbers) -> list[Card]:
     )
     checked, at_map = good.get("checkpoints"), good.get("map")
     if checked and checked["n"]:
-        detail = f"vertical {number(checked['rmse_v_m'])} m · {checked['n']} of {CHECKPOINTS} checkpoints"
+        detail = f"vertical {number(checked['rmse_v_m'])} m · {checked['n']} of {REQUIRED} checkpoints"
         cards.append(Card(f"{number(checked['rmse_h_m'])} m", "RMSE horizontal", detail))
     elif at_map and at_map["rmse_z_m"] is not None:
         detail = f"horizontal {number(at_map['rmse_h_m'])} m · against the reference along the rays"
@@ -149,7 +150,7 @@ def good_lines(numbers: Numbers) -> Iterator[Line]:
         short = f"; {checked['shortfall']} short of {checked['required']}" if checked["shortfall"] else ""
         yield Line("Checkpoints", f"{_rmse(checked)} at {checked['n']}, as delivered{short}")
     else:
-        yield Line("Checkpoints", f"none of the {CHECKPOINTS} that ASPRS asks for")
+        yield Line("Checkpoints", f"none of the {REQUIRED} that ASPRS asks for")
     shares = good["calibration"]
     if shares["within_1_sigma"] is not None:
         told = f"{share(shares['within_1_sigma'])} within one sigma, {share(shares['within_2_sigma'])} within two"

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyarrow as pa
 
-from pipeline.geometry.arrays import Bools, Floats
+from pipeline.geometry.arrays import Bools, Floats, Singles
+from pipeline.monodepth.sampling import sampled
 from pipeline.scoring.cloud_scores import CloudJob, CloudScore, score_cloud
 from pipeline.scoring.depth_rows import AlignedDepths
 from pipeline.scoring.frame_sums import FrameSums, Scored
@@ -40,22 +41,18 @@ class Baselines:
     Args:
         names: Of the methods.
         images: Where the frames' images lie.
-        depths_at: From an image's location and pixels (n, 2) to depths (n,) m by name, NaN for none.
+        depth_maps: From an image's location to depths (h, w) along the optical axis, m, by name.
         device: What their networks run on.
     """
 
     names: tuple[str, ...]
     images: Mapping[str, str]
-    depths_at: Callable[[str, Floats], Mapping[str, Floats]]
+    depth_maps: Callable[[str], Mapping[str, Singles]]
     device: str = "cpu"
 
-    def beside(self, lines: AlignedDepths, frame_id: str) -> AlignedDepths:
-        """The lines of a frame with these methods beside the others."""
-        if not self.names:
-            return lines
-        found = self.depths_at(self.images[frame_id], lines.pixels) if len(lines.pixels) else {}
-        nothing = np.full(len(lines.pixels), np.nan)
-        return lines.with_methods(self.names, np.stack([found.get(name, nothing) for name in self.names], axis=1))
+    def maps(self, frame_id: str) -> Mapping[str, Singles]:
+        """What they say of a frame's image."""
+        return self.depth_maps(self.images[frame_id])
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +133,9 @@ def score_frames(job: ScoringJob, items: Sequence[FrameView]) -> list[ShardScore
         UndeterminedError: A height datum or the geoid between two is not known.
     """
     near, correction = job.truth.near(items), job.correction
-    held = _Held(job.lines.near(items), job.cloud.near(items) if job.cloud else None)
+    # A network's look at an image is by far the dearest, and the same against every placing of the truth.
+    maps = {item.frame_id: job.baselines.maps(item.frame_id) for item in items} if job.baselines else {}
+    held = _Held(job.lines.near(items), job.cloud.near(items) if job.cloud else None, maps)
     if correction is None:
         return [_against(job, near, held, items)]
     corrected = [_corrected(item, correction) for item in items]
@@ -150,6 +149,7 @@ class _Held:
 
     lines: NearLines
     points: NearPoints | None
+    maps: Mapping[str, Mapping[str, Singles]]
 
 
 def _against(
@@ -163,7 +163,7 @@ def _against(
     for item in items:
         seen = near.seen_by(item)
         mine = held.lines.of(item, seen)
-        scored = _scored(job, item, seen, mine)
+        scored = _scored(job, item, seen, mine, held.maps.get(item.frame_id, {}))
         sums = FrameSums.of(scored, job.max_range_m)
         scores.append(FrameScore(item.frame_id, len(mine.pixels), len(seen.depth_m), sums))
         tables.append(_table(scored))
@@ -185,7 +185,9 @@ def _corrected(item: FrameView, correction: Correction) -> FrameView:
     return replace(item, covariance=covariance)
 
 
-def _scored(job: ScoringJob, item: FrameView, seen: FrameTruth, mine: AlignedDepths) -> Scored:
+def _scored(
+    job: ScoringJob, item: FrameView, seen: FrameTruth, mine: AlignedDepths, maps: Mapping[str, Singles]
+) -> Scored:
     """The pixels that have a reference, with every method."""
     reference = seen.reference_at(mine.pixels)
     valid = reference.valid
@@ -195,7 +197,8 @@ def _scored(job: ScoringJob, item: FrameView, seen: FrameTruth, mine: AlignedDep
     lines, found = mine.where(has), reference.where(has)
     by_pose = seen.pose_sigma(lines.pixels, found)
     if job.baselines is not None:
-        lines = job.baselines.beside(lines, item.frame_id)
+        names = job.baselines.names
+        lines = lines.with_methods(names, np.stack([sampled(maps[name], lines.pixels) for name in names], axis=1))
     camera = item.view.camera
     rays: Floats = camera.rays(lines.pixels) @ item.view.rotation_enu_from_cam.T
     return Scored(lines, found, by_pose, rays, (camera.width, camera.height))

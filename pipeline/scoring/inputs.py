@@ -31,7 +31,7 @@ from pipeline.lidar.visibility import View
 from pipeline.matching.matcher import SearchLimits
 from pipeline.matching.matchers import MatcherSetting, device_of, weights_of
 from pipeline.matching.reach import Band
-from pipeline.monodepth.baselines import BaselineSetting, depths_at
+from pipeline.monodepth.baselines import BaselineSetting, depth_maps
 from pipeline.scoring.cloud_scores import CloudJob, survey_covariance
 from pipeline.scoring.dense import DenseLines, DensePair
 from pipeline.scoring.frame_scores import Baselines
@@ -158,7 +158,7 @@ def baselines_of(context: Context, names: tuple[str, ...], models: str | None) -
         return None
     found = BaselineSetting.find(names, models, context.setting("match.device"))
     context.record("baselines", {model.baseline: model.provenance for model in found.models})
-    return Baselines(names, images_of(context), partial(depths_at, found), found.device)
+    return Baselines(names, images_of(context), partial(depth_maps, found), found.device)
 
 
 def device_of_job(lines: Lines, baselines: Baselines | None) -> str:
